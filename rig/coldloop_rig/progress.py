@@ -8,8 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
 from coldloop.process.declaration import Process
-from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import PlantSample
+from coldloop.registers import optimizer_plc, plant
 from coldloop_rig.results.recording import Sink
 
 REFRESH_S: Final = 0.1
@@ -63,11 +62,11 @@ class RunProgress(PlantTimeBar, Sink):
         """Begin to count the speed."""
         self._began = time.monotonic()
 
-    def reported(self, update: Optimization) -> None:
+    def reported(self, update: optimizer_plc.Optimization) -> None:
         """Remember what the optimiser does."""
         self._updating = f"  tau_u {update.tau_u * self._process.tick_s:.2f} s  J {update.j_effective:.3g}"
 
-    def sample(self, sample: PlantSample) -> None:
+    def sample(self, sample: plant.PlantSample) -> None:
         """Show where the run is, a few times a second."""
         self._done = sample.tick + 1
         last = self._done == self._ticks

@@ -8,9 +8,8 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Final
 
-from coldloop.errors import LinkError, UsageError
+from coldloop import errors, service
 from coldloop.process.updating_periods import duration
-from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands import options as common
 from coldloop_rig.interruption import run_until_interrupted
 
@@ -29,7 +28,7 @@ def plans() -> list[str]:
 
 
 def _declare_chaos(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
+    service.add_configuration_options(parser)
     plan = parser.add_argument("plan", type="name", nargs="?", metavar="PLAN", help="a shipped plan, or a TOML file")
     plan.completer = lambda **_: plans()  # type: ignore[attr-defined]  # argcomplete looks for it
     parser.add_argument("--list", action="store_true", help="list the shipped plans")
@@ -56,38 +55,37 @@ def execute_chaos(options: argparse.Namespace) -> int:
         return 0
     common.check_load(options.plan_load)
     if options.plan is None:
-        raise UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
+        raise errors.UsageError("name a plan; `coldloop chaos --list` lists the shipped ones")
     from coldloop.process.settings import settings_of
-    from coldloop_chaos.faults import OF_PLAN, find_plan
+    from coldloop_chaos import faults, report
 
     effective = common.configuration(options)
     given = {name: getattr(options, f"plan_{name}") for name in ("seed", "load", "mode", "factor")}
     given["duration_s"] = options.duration and options.duration.seconds
     with settings_of(effective.settings.process):
-        plan = find_plan(options.plan, {name: value for name, value in given.items() if value is not None})
+        plan = faults.find_plan(options.plan, {name: value for name, value in given.items() if value is not None})
     retained = "the states are retained in the folder of the results"
     ineffective = {
-        **{key: f"the plan has its own value; change it with {option}" for key, option in OF_PLAN.items()},
+        **{key: f"the plan has its own value; change it with {option}" for key, option in faults.OF_PLAN.items()},
         **dict.fromkeys(("plant.retain.file", "control_plc.retain.file"), retained),
     }
     common.refuse_ineffective(effective, common.OWN_PORTS, ineffective)
-    from coldloop_chaos.report import ChaosProgress, perform, plot_chaos, summary_lines, table, write_report
     from coldloop_rig.results.run_folder import claim_folder, claim_folder_of_now, writing
     from coldloop_rig.runs.running import plain_arguments
 
     out = options.out or claim_folder_of_now(Path("chaos"), plan.name)
     claim_folder(out, force=options.force)
-    with ChaosProgress(plan) as progress:
+    with report.ChaosProgress(plan) as progress:
         arguments = plain_arguments(options)
-        experiment = perform(plan, effective, out, progress, arguments=arguments, formats=options.figures)
+        experiment = report.perform(plan, effective, out, progress, arguments=arguments, formats=options.figures)
     with writing(out, "no report was written, choose another --out"):
-        write_report(out, experiment)
-        plot_chaos(out / "chaos.png", experiment)
-    sys.stdout.write(table(experiment.evaluation.rows, plan.process))
-    lines = (*summary_lines(experiment.trace, experiment.evaluation), f"results in {out}")
+        report.write_report(out, experiment)
+        report.plot_chaos(out / "chaos.png", experiment)
+    sys.stdout.write(report.table(experiment.evaluation.rows, plan.process))
+    lines = (*report.summary_lines(experiment.trace, experiment.evaluation), f"results in {out}")
     sys.stdout.write("".join(f"{line}\n" for line in lines))
     if experiment.failure is not None:
-        raise LinkError(experiment.failure)
+        raise errors.LinkError(experiment.failure)
     return 0
 
 
@@ -111,7 +109,9 @@ def execute_proxy(options: argparse.Namespace) -> int:
 
     plan = find_link_plan(options.plan, {} if options.seed is None else {"seed": options.seed})
     if options.listen == options.to:
-        raise UsageError(f"--listen {options.to.host}:{options.to.port} is the server itself; listen at another port")
+        raise errors.UsageError(
+            f"--listen {options.to.host}:{options.to.port} is the server itself; listen at another port"
+        )
     target = Endpoint(host=options.to.host, port=options.to.port)
     return 130 if run_until_interrupted(lambda: disturb(plan, options.listen, target, common.say)) else 0
 

@@ -12,8 +12,7 @@ from typing import Annotated, Any, ClassVar, Final, Literal, Self, TypeVar
 import pydantic
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from coldloop.config import Configuration
-from coldloop.errors import LoadFileError, UsageError
+from coldloop import config, errors
 from coldloop.process.settings import ProcessSettings, declared, one_of, settings_process, within
 from coldloop.process.updating_periods import whole_ticks
 from coldloop.session import TimeMode
@@ -381,7 +380,7 @@ class ChaosPlan(ProcessSettings):
             return settings
         return settings.model_copy(update={"plant": settings.plant.model_copy(update={"kind": self.plant})})
 
-    def configured(self, effective: Configuration[Settings]) -> Configuration[Settings]:
+    def configured(self, effective: config.Configuration[Settings]) -> config.Configuration[Settings]:
         """Return a configuration with the values of the plan, as a manifest records it."""
         settings = self.with_plant(effective.settings)
         load = self.load if isinstance(self.load, str) else ", ".join(self.load)
@@ -389,7 +388,7 @@ class ChaosPlan(ProcessSettings):
         session = settings.session.model_copy(update={"mode": self.mode, "factor": self.factor})
         planned = settings.with_program(updating_period_s=self.updating_period_s)
         planned = planned.model_copy(update={"plant": plant, "session": session})
-        return Configuration(planned, {**effective.sources, **dict.fromkeys(OF_PLAN, f"plan {self.name}")})
+        return config.Configuration(planned, {**effective.sources, **dict.fromkeys(OF_PLAN, f"plan {self.name}")})
 
     def scenario(self, mean_w: float) -> Scenario:
         """Return the run without its faults; `mean_w` is the load of the operating point."""
@@ -399,7 +398,9 @@ class ChaosPlan(ProcessSettings):
             families = []
             for name in self.load:
                 if (here := named_families(name)) is None:
-                    raise LoadFileError(f"load {name}: only named loads can follow each other; give a CSV file alone")
+                    raise errors.LoadFileError(
+                        f"load {name}: only named loads can follow each other; give a CSV file alone"
+                    )
                 families += here
             load = concatenated([telegraph(family, mean_w) for family in families])
         return Scenario(
@@ -415,7 +416,7 @@ def shipped_plans() -> list[ChaosPlan]:
         if entry.name.endswith(".toml"):
             try:
                 plans.append(parsed_plan(ChaosPlan, entry.read_text(encoding="utf-8"), entry.name, {}))
-            except UsageError:  # its signals or its plant are another process's
+            except errors.UsageError:  # its signals or its plant are another process's
                 continue
     return sorted(plans, key=lambda plan: plan.name)
 
@@ -426,7 +427,7 @@ def find_plan(name: str, changes: dict[str, Any]) -> ChaosPlan:
     if "/" not in name and shipped.is_file():
         return parsed_plan(ChaosPlan, shipped.read_text(encoding="utf-8"), name, changes)
     if not Path(name).exists():
-        raise UsageError(f"plan {name}: neither a file nor a shipped plan; `coldloop chaos --list` names them")
+        raise errors.UsageError(f"plan {name}: neither a file nor a shipped plan; `coldloop chaos --list` names them")
     return parsed_plan(ChaosPlan, read_text(Path(name), REMEDY), name, changes)
 
 
@@ -440,7 +441,7 @@ def parsed_plan(kind: type[P], text: str, source: str, changes: dict[str, Any]) 
     try:
         content = parsed_toml(text)
     except ValueError as error:
-        raise UsageError(f"{source}: not TOML: {error}") from None
+        raise errors.UsageError(f"{source}: not TOML: {error}") from None
     if "duration_s" in changes:
         end_s = changes["duration_s"]
         content["faults"] = [
@@ -455,4 +456,4 @@ def parsed_plan(kind: type[P], text: str, source: str, changes: dict[str, Any]) 
         message = " ".join(first["msg"].removeprefix("Value error, ").split())
         if first["type"] == "extra_forbidden":
             message = "no such key; `coldloop docs chaos` lists them"
-        raise UsageError(f"{source}: {f'{where}: ' if where else ''}{message}") from None
+        raise errors.UsageError(f"{source}: {f'{where}: ' if where else ''}{message}") from None

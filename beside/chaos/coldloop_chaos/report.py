@@ -14,21 +14,16 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn
 
-from coldloop.config import Configuration
-from coldloop.errors import LinkError
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import load as load_model
-from coldloop.registers.common import AlarmState, EventKind, alarm_key, alarms_of
-from coldloop.registers.control_plc import LadderStatus, Mode
+from coldloop import config, errors, text
+from coldloop.process import declaration, lti_model
+from coldloop.registers import common, control_plc
 from coldloop.service.journal import alarm_word
-from coldloop.text import ends_text, parsed_json, whole_file, whole_text
 from coldloop_chaos.faults import ChaosPlan
 from coldloop_chaos.sequencer import ChaosTrace, Mark, ShowProgress, conduct
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.cosim.scenario import Job
-from coldloop_rig.figures import plot
-from coldloop_rig.figures.worker import FigureProcess
+from coldloop_rig.figures import plot, worker
 from coldloop_rig.progress import PlantTimeBar, clock, make_console
 from coldloop_rig.results.recording import Recorder, Recording, Way, excess_of
 from coldloop_rig.results.run_folder import write_json
@@ -105,15 +100,15 @@ def evaluate(trace: ChaosTrace, undisturbed: Recording, rate: Numbers, design: C
 
 def _row(trace: ChaosTrace, mark: Mark, last_event: int, measured: tuple[Numbers, Numbers, Numbers]) -> Row:
     tick_s = trace.process.tick_s
-    before = [Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
+    before = [control_plc.Mode(event.subject) for event in trace.modes(0, mark.first_event)[-1:]]
     changes = trace.modes(mark.first_event, last_event)
-    modes = [*before, *(Mode(event.subject) for event in changes)]
+    modes = [*before, *(control_plc.Mode(event.subject) for event in changes)]
     lasted_s = back_s = None
     if mark.end is not None:
         lasted_s = (mark.end - mark.begin) * tick_s
-        at_end = [*before, *(Mode(event.subject) for event in changes if event.tick <= mark.end)]
-        back = [event.tick for event in changes if event.tick > mark.end and event.subject == Mode.MPC]
-        if at_end and at_end[-1] is Mode.MPC:
+        at_end = [*before, *(control_plc.Mode(event.subject) for event in changes if event.tick <= mark.end)]
+        back = [event.tick for event in changes if event.tick > mark.end and event.subject == control_plc.Mode.MPC]
+        if at_end and at_end[-1] is control_plc.Mode.MPC:
             back_s = 0.0
         elif back:
             back_s = (back[0] - mark.end) * tick_s
@@ -121,10 +116,11 @@ def _row(trace: ChaosTrace, mark: Mark, last_event: int, measured: tuple[Numbers
     instants = (mark.begin, mark.begin if mark.done is None else mark.done)
     alarms = tuple(
         RaisedAlarm(
-            alarm_key(event.subject, trace.process).upper(), *(max(0, event.tick - at) * tick_s for at in instants)
+            common.alarm_key(event.subject, trace.process).upper(),
+            *(max(0, event.tick - at) * tick_s for at in instants),
         )
         for event in trace.events[mark.first_event : last_event]
-        if event.kind == EventKind.ALARM_RAISED
+        if event.kind == common.EventKind.ALARM_RAISED
     )
     return Row(mark.fault.label, mark.begin * tick_s, lasted_s, passed, alarms, *measured, back_s)
 
@@ -143,7 +139,7 @@ class Experiment(NamedTuple):
 
 
 def perform(
-    plan: ChaosPlan, effective: Configuration[Settings], folder: Path, progress: ShowProgress, *,
+    plan: ChaosPlan, effective: config.Configuration[Settings], folder: Path, progress: ShowProgress, *,
     arguments: Mapping[str, Any], formats: Sequence[str],
 ) -> Experiment:  # fmt: skip
     """Run a plan into a folder that is claimed, and the same without faults; a run that fails is evaluated as it is.
@@ -152,14 +148,14 @@ def perform(
     the plan cannot be had; ColdloopError: the run was interrupted, or failed before its first tick.
     """
     settings = plan.with_plant(effective.settings)
-    scenario = plan.scenario(load_model(settings.model.file).w0)
+    scenario = plan.scenario(lti_model.load(settings.model.file).w0)
     trace = ChaosTrace(scenario.ticks, settings.process)
     failure, conducted = None, partial(conduct, plan, scenario, settings, trace, progress)
     try:
         job = Job(plan.configured(effective), scenario, Way.CHAOS, conduct=conducted)
-        with FigureProcess(formats) as figure:
+        with worker.FigureProcess(formats) as figure:
             run_into(folder, job, arguments, figure, [trace])
-    except LinkError as error:
+    except errors.LinkError as error:
         if trace.missing == trace.ticks:
             raise
         failure = str(error)
@@ -185,14 +181,14 @@ class ChaosProgress(PlantTimeBar):
         self._plan = plan
         self._shown = time.monotonic()
 
-    def __call__(self, tick: int, ladder: LadderStatus | None, faults: list[str]) -> None:
+    def __call__(self, tick: int, ladder: control_plc.LadderStatus | None, faults: list[str]) -> None:
         """Show where the run is, a few times a second, and its end."""
         now = time.monotonic()
         if now - self._shown < REFRESH_S and tick < self._plan.ticks:
             return
         self._shown = now
         self._bar.start()
-        line = "  ".join([Mode(ladder.mode).name if ladder is not None else "control PLC away", *faults])
+        line = "  ".join([control_plc.Mode(ladder.mode).name if ladder is not None else "control PLC away", *faults])
         self._bar.update(self._task, completed=tick, clock=clock(tick * self._plan.process.tick_s), line=line)
         self._bar.refresh()
 
@@ -200,7 +196,7 @@ class ChaosProgress(PlantTimeBar):
 MANY_MODES: Final = 8  # more modes than this are not all named in a table
 
 
-def table(rows: Sequence[Row], process: Process) -> str:
+def table(rows: Sequence[Row], process: declaration.Process) -> str:
     """Return all rows for a terminal."""
     return aligned(_cells(rows, process))
 
@@ -209,7 +205,7 @@ def write_report(out: Path, experiment: Experiment) -> None:
     """Write chaos.json and chaos.md."""
     plan, trace, undisturbed, evaluation, _, failure = experiment
     write_json(out / "chaos.json", {
-        "plan": parsed_json(plan.model_dump_json()),
+        "plan": text.parsed_json(plan.model_dump_json()),
         "failure": failure,
         "faults": [
             {**row._asdict(), "alarms": [alarm._asdict() for alarm in row.alarms], "back_s": row.back_s}
@@ -221,7 +217,7 @@ def write_report(out: Path, experiment: Experiment) -> None:
         "missing_ticks": evaluation.missing_ticks,
         "lost_contacts": trace.lost_contacts,
         "ladder": trace.ladder._asdict() if trace.ladder else None,
-        "alarms": {alarm_key(i, trace.process).upper(): alarm._asdict() for i, alarm in enumerate(trace.alarms)},
+        "alarms": {common.alarm_key(i, trace.process).upper(): alarm._asdict() for i, alarm in enumerate(trace.alarms)},
         "events": [event._asdict() for event in trace.events],
         "resources": [sample._asdict() for sample in trace.resources],
         "log_lines": trace.log_lines,
@@ -239,7 +235,7 @@ def write_report(out: Path, experiment: Experiment) -> None:
         *(f"- {line}" for line in summary_lines(trace, evaluation)),
         "\n![Outputs, inputs, modes, faults](chaos.png)\n",
     ]
-    whole_text(out / "chaos.md", "\n".join(lines))
+    text.whole_text(out / "chaos.md", "\n".join(lines))
 
 
 def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
@@ -256,8 +252,8 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
         f"ticks not seen: {evaluation.missing_ticks} of {trace.ticks}",
     ]
     if trace.ladder is not None:
-        lines.append(f"mode at the end: {Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
-    active = [alarm_word(i, process) for i, alarm in enumerate(trace.alarms) if alarm.state != AlarmState.NORMAL]
+        lines.append(f"mode at the end: {control_plc.Mode(trace.ladder.mode).name}, {trace.ladder.events} events")
+    active = [alarm_word(i, process) for i, alarm in enumerate(trace.alarms) if alarm.state != common.AlarmState.NORMAL]
     if active:
         lines.append(f"alarms active or unacknowledged: {', '.join(active)}")
     for service, count in trace.log_lines.items():
@@ -268,10 +264,12 @@ def summary_lines(trace: ChaosTrace, evaluation: Evaluation) -> list[str]:
     return lines
 
 
-def _cells(rows: Sequence[Row], process: Process) -> list[list[str]]:
+def _cells(rows: Sequence[Row], process: declaration.Process) -> list[list[str]]:
     """Return the headings, and the cells of each row; each alarm once, when it was first raised and how often."""
     bands = [f"{one.name} out s (was)" for one in process.banded]
-    words = {alarm_key(alarm, process).upper(): alarm_word(alarm, process) for alarm in alarms_of(process)}
+    words = {
+        common.alarm_key(alarm, process).upper(): alarm_word(alarm, process) for alarm in common.alarms_of(process)
+    }
     cells = [["fault", "at s", "lasted s", "modes", "alarms (s after)", "step/limit", *bands, "back to MPC s"]]
     for row in rows:
         modes: Sequence[str] = row.modes
@@ -308,7 +306,7 @@ def plot_chaos(path: Path, experiment: Experiment) -> None:
         axes: list[Axes] = panels
         controlled = zip(process.controlled, process.banded, bands, strict=True)
         for place, (output, one, band) in zip(axes, controlled, strict=False):
-            place.axhspan(*band, color=plot.BAND, alpha=0.35, label=f"band {ends_text(*band)}")
+            place.axhspan(*band, color=plot.BAND, alpha=0.35, label=f"band {text.ends_text(*band)}")
             place.plot(minutes, undisturbed.y[:, output], color=plot.THIRD, linewidth=0.8, label="undisturbed")
             place.plot(minutes, recording.y[:, output], color=plot.INK, linewidth=1, label="with faults")
             place.set_ylabel(plot.with_unit(one.name, one.unit))
@@ -337,12 +335,12 @@ def plot_chaos(path: Path, experiment: Experiment) -> None:
         ribbon.set_xlim(0, trace.ticks * process.tick_s / 60)
         plot.label_marks(figure)
         figure.suptitle(f"{plan.name}: {plan.description}")
-        whole_file(path, lambda draft: figure.savefig(draft, dpi=130, format="png"))
+        text.whole_file(path, lambda draft: figure.savefig(draft, dpi=130, format="png"))
 
 
 def _draw_modes(axes: Axes, trace: ChaosTrace) -> None:
     tick_s = trace.process.tick_s
-    changes = [(event.tick, Mode(event.subject)) for event in trace.modes()]
+    changes = [(event.tick, control_plc.Mode(event.subject)) for event in trace.modes()]
     ends = [tick for tick, _ in changes[1:]] + [trace.ticks]
     for (tick, mode), end in zip(changes, ends, strict=False):
         axes.axvspan(tick * tick_s / 60, end * tick_s / 60, color=plot.MODE_COLOURS[mode.name.lower()], linewidth=0)

@@ -13,18 +13,14 @@ from typing import Final, NamedTuple, TypeVar
 import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
-from coldloop.config import PREFIX
-from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError, UsageError
+from coldloop import config, errors
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.cold_box import L1, TICK_S
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 from coldloop.process.lti_model import discretise, load
 from coldloop.process.settings import settings_of
-from coldloop.registers.common import Alarm, Event, EventKind, Identity, alarms_of
-from coldloop.registers.control_plc import LadderStatus
+from coldloop.registers import common, control_plc
 from coldloop.registers.plant import PlantSample, SensorFault, SensorFaultKind, Surroundings
-from coldloop_chaos import faults
-from coldloop_chaos.proxy import LinkProxies
+from coldloop_chaos import faults, proxy
 from coldloop_plant.cold_box.model import find_equilibrium, linearise
 from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import box_of
@@ -48,9 +44,9 @@ def save_wrong_model(right: Path, wrong: Path) -> None:
         less.save(wrong)
         return
     box = box_of(model)
-    rest = find_equilibrium(model.u0 + np.array(MOVED_INPUTS), float(model.y0[L1]), box, helium)
+    rest = find_equilibrium(model.u0 + np.array(MOVED_INPUTS), float(model.y0[cold_box.L1]), box, helium)
     linear = linearise(rest.x, rest.u, rest.w, box, helium)
-    tick = discretise(linear.A, linear.B, linear.F, TICK_S)
+    tick = discretise(linear.A, linear.B, linear.F, cold_box.TICK_S)
     replace(
         model, **linear._asdict(), A_tick=tick.A, B_tick=tick.B, F_tick=tick.F,
         x0=rest.x, u0=rest.u, w0=rest.w, y0=rest.y,
@@ -68,7 +64,7 @@ class Injector:
     """Acts on the processes, the links and the plant's sensors of one run, in whose folder is a wrong model."""
 
     services: networked_run.LocalServices
-    links: LinkProxies
+    links: proxy.LinkProxies
     plant: RegisterClient
     folder: Path
     _given_before: dict[str, float] = field(default_factory=dict)
@@ -79,7 +75,7 @@ class Injector:
         Raises UsageError: there is no such fault, or a parameter is missing or wrong.
         """
         if of_plan := [name for name in ("at_s", "duration_s", "offset_ms") if name in parameters]:
-            raise UsageError(
+            raise errors.UsageError(
                 f"fault '{kind}': {of_plan[0]} belongs to a plan; here the context decides when it begins and ends"
             )
         try:
@@ -88,7 +84,7 @@ class Injector:
         except ValidationError as error:
             first = error.errors()[0]
             where = ".".join(str(part) for part in first["loc"] if part != kind)
-            raise UsageError(f"fault '{kind}': {f'{where}: ' if where else ''}{first['msg']}") from None
+            raise errors.UsageError(f"fault '{kind}': {f'{where}: ' if where else ''}{first['msg']}") from None
         if isinstance(fault, faults.WrongModel):
             save_wrong_model(model, self.folder / WRONG_MODEL)
         return fault
@@ -110,7 +106,7 @@ class Injector:
             self._given_before.setdefault(fault.target, before)
         elif isinstance(fault, faults.WrongModel):
             await self.services.stop("optimizer_plc", signal.SIGTERM)
-            model = {f"{PREFIX}MODEL__FILE": str(self.folder / WRONG_MODEL)}
+            model = {f"{config.PREFIX}MODEL__FILE": str(self.folder / WRONG_MODEL)}
             await self.services.start("optimizer_plc", model, may_end=True)
 
     async def end(self, fault: faults.AnyFault) -> str | None:
@@ -157,12 +153,12 @@ async def _insisted(request: Callable[[], Awaitable[T]], what: str) -> T:
         try:
             async with asyncio.timeout(session.CONTACT_S):
                 return await request()
-        except (PeerUnreachableError, RequestRefusedError) as error:
+        except (errors.PeerUnreachableError, errors.RequestRefusedError) as error:
             reason = str(error)
         except TimeoutError:
             pass
         await asyncio.sleep(0.5)
-    raise LinkError(f"the plant did not accept {what}: {reason}")
+    raise errors.LinkError(f"the plant did not accept {what}: {reason}")
 
 
 class Moment(NamedTuple):
@@ -248,11 +244,11 @@ class ChaosTrace(Sink):
     """Collects during a run; ticks that were not recorded stay NaN."""
 
     ticks: int
-    process: Process
-    events: list[Event] = field(default_factory=list)
+    process: declaration.Process
+    events: list[common.Event] = field(default_factory=list)
     """Events of the control PLC, in the order of arrival."""
-    alarms: list[Alarm] = field(default_factory=list)
-    ladder: LadderStatus | None = None
+    alarms: list[common.Alarm] = field(default_factory=list)
+    ladder: control_plc.LadderStatus | None = None
     marks: list[Mark] = field(default_factory=list)
     resources: list[Resources] = field(default_factory=list)
     log_lines: dict[str, int] = field(default_factory=dict)
@@ -270,14 +266,14 @@ class ChaosTrace(Sink):
         for rows, values in zip(self._rows, ((sample.load,), sample.u, sample.y, sample.x), strict=True):
             rows[sample.tick] = np.array(values)
 
-    def event(self, service: str, event: Event) -> None:
+    def event(self, service: str, event: common.Event) -> None:
         """Take an event of a journal."""
         if service == CONTROL:
             self.events.append(event)
 
-    def modes(self, first: int = 0, last: int | None = None) -> list[Event]:
+    def modes(self, first: int = 0, last: int | None = None) -> list[common.Event]:
         """Return the changes of mode among the events from one index to before another."""
-        return [event for event in self.events[first:last] if event.kind == EventKind.MODE]
+        return [event for event in self.events[first:last] if event.kind == common.EventKind.MODE]
 
     @property
     def missing(self) -> int:
@@ -301,7 +297,7 @@ def resident_mb(services: networked_run.LocalServices) -> dict[str, float]:
     return sizes
 
 
-ShowProgress = Callable[[int, LadderStatus | None, list[str]], None]
+ShowProgress = Callable[[int, control_plc.LadderStatus | None, list[str]], None]
 """Takes the plant's tick, the state of the control PLC (None while it does not answer), and the faults that are on."""
 
 STANDSTILL_PATIENCE_S: Final = 60.0  # a rig that does not move for so long without a fault is given up
@@ -338,7 +334,9 @@ class FaultSequencer:
                 await self._end(moment)
             self._stopped_since = time.monotonic()
         control, contact = self.client.control, self.client.contact
-        self.trace.alarms = await contact(control.read_rows(Alarm, 0, len(alarms_of(control.process)))) or []
+        self.trace.alarms = (
+            await contact(control.read_rows(common.Alarm, 0, len(common.alarms_of(control.process)))) or []
+        )
         await self.client.conclude()
 
     def finish(self) -> None:
@@ -367,7 +365,7 @@ class FaultSequencer:
                 await self.client.grant(min(self._timeline.next_tick or self.plan.ticks, self.plan.ticks))
             await asyncio.sleep(LOOK_S)
 
-    async def _look(self) -> LadderStatus | None:
+    async def _look(self) -> control_plc.LadderStatus | None:
         """Record what has happened; return the state of the control PLC, None while it does not answer."""
         tick = await self.client.look()
         ladder = await self.client.ladder()
@@ -391,7 +389,7 @@ class FaultSequencer:
                 return self._timeline.take(end)
         tick_s = self.plan.process.tick_s
         if not self._timeline.on and stopped_s > max(STANDSTILL_PATIENCE_S, 4 * tick_s / self.plan.factor):
-            raise LinkError(
+            raise errors.LinkError(
                 f"plan {self.plan.name}: the plant has been at {self.tick * tick_s:g} s for {stopped_s:.0f} s "
                 f"without a fault: see {self.services.log('control_plc')}"
             )
@@ -419,9 +417,11 @@ class FaultSequencer:
         started = await self.injector.end(moment.fault)
         if started is not None:
             since = time.monotonic()
-            while await self.client.contact(self.client.clients[started].read(Identity)) is None:
+            while await self.client.contact(self.client.clients[started].read(common.Identity)) is None:
                 if time.monotonic() - since > RESTART_PATIENCE_S:
-                    raise LinkError(f"after '{moment.fault.label}' the {started} service does not answer: see its log")
+                    raise errors.LinkError(
+                        f"after '{moment.fault.label}' the {started} service does not answer: see its log"
+                    )
                 if self.plan.realtime:
                     await self._look()
                 await asyncio.sleep(LOOK_S)
@@ -430,7 +430,7 @@ class FaultSequencer:
         await self._look()
         mark.end = self.tick
 
-    async def _hold_time(self, until: Callable[[LadderStatus | None], bool]) -> None:
+    async def _hold_time(self, until: Callable[[control_plc.LadderStatus | None], bool]) -> None:
         """Hold plant time in lock-step until something is so; without an optimiser it runs as fast as it can."""
         since = time.monotonic()
         while time.monotonic() - since < PRESENCE_S:
@@ -453,7 +453,7 @@ async def conduct(
         await asyncio.to_thread(save_wrong_model, settings.model.file, folder / WRONG_MODEL)
     copied = with_copied_load(settings, scenario.load, folder)
     async with contextlib.AsyncExitStack() as stack:
-        links = LinkProxies(str(plan.seed))
+        links = proxy.LinkProxies(str(plan.seed))
         retained = wiring.retaining(copied, folder, always=True)
         services = await stack.enter_async_context(networked_run.LocalServices(retained, folder / "logs", links=links))
         client = session.SessionClient(services.endpoints, settings, tolerant=True)
@@ -467,7 +467,7 @@ async def conduct(
             async with asyncio.timeout(patience_s):
                 await services.during(driver.run())
         except TimeoutError:
-            raise LinkError(
+            raise errors.LinkError(
                 f"plan {plan.name} has taken {patience_s:.0f} s of real time and is at "
                 f"{driver.tick * plan.process.tick_s:g} s: see the logs in {folder / 'logs'}"
             ) from None

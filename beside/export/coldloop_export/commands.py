@@ -5,8 +5,7 @@ import sys
 from pathlib import Path
 from typing import Final
 
-from coldloop.errors import UsageError
-from coldloop.service import add_configuration_options
+from coldloop import errors, service
 from coldloop_rig.cli.commands.options import Command, positive_count
 
 PLC: Final = Path("plc")
@@ -16,7 +15,7 @@ GROUP: Final = {"export": "a run"}
 
 
 def _declare(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
+    service.add_configuration_options(parser)
     parser.add_argument("run", type="folder", metavar="RUN", help="folder of a run; plc, with --target: the optimiser")
     kinds = parser.add_mutually_exclusive_group(required=True)
     for kind, text in (
@@ -44,9 +43,9 @@ def execute_export(options: argparse.Namespace) -> int:
     if options.target is not None:
         paths = _optimizer(options)
     elif options.ticks is not None:
-        raise UsageError("--ticks: is for coldloop export plc --target")
+        raise errors.UsageError("--ticks: is for coldloop export plc --target")
     elif options.config or options.assignments or options.plc or options.score:
-        raise UsageError("--config, --set, --plc and --score: are for coldloop export plc --target")
+        raise errors.UsageError("--config, --set, --plc and --score: are for coldloop export plc --target")
     else:
         from coldloop_rig.results.run_folder import export
 
@@ -58,22 +57,23 @@ def execute_export(options: argparse.Namespace) -> int:
 def _optimizer(options: argparse.Namespace) -> list[Path]:
     """Write the optimiser of the paper's PLC, unless the user says otherwise."""
     from coldloop.config import load_configuration
-    from coldloop_export.folder import export_plc
-    from coldloop_export.golden import SINGLE
+    from coldloop_export import folder, golden
     from coldloop_rig.cli import process_setting
     from coldloop_rig.plc_sizing.plc import find_profile
     from coldloop_rig.settings import Settings
 
     if options.run != PLC:
-        raise UsageError(f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER")
+        raise errors.UsageError(
+            f"{options.run}: has no target; coldloop export plc --target {options.target} --out FOLDER"
+        )
     if options.out is None or options.force:
-        raise UsageError("export plc: name a new folder with --out; --force does not replace one")
+        raise errors.UsageError("export plc: name a new folder with --out; --force does not replace one")
     if options.score and options.target != "c":
-        raise UsageError(f"--score: is for --target c; no linker makes a program of {options.target} here")
+        raise errors.UsageError(f"--score: is for --target c; no linker makes a program of {options.target} here")
     profile = find_profile(options.plc) if options.plc else None
-    assignments, process = [*SINGLE, *options.assignments], process_setting(options.assignments)
+    assignments, process = [*golden.SINGLE, *options.assignments], process_setting(options.assignments)
     loaded = load_configuration(Settings, file=options.config, assignments=assignments, options=process)
-    return export_plc(options.target, options.ticks, options.out, loaded.settings, profile, score=options.score)
+    return folder.export_plc(options.target, options.ticks, options.out, loaded.settings, profile, score=options.score)
 
 
 COMMANDS: Final = {"export": Command(_declare, execute_export)}

@@ -18,17 +18,11 @@ from typing import Any, Final, TypeAlias
 import numpy as np
 from pydantic import BaseModel
 
-from coldloop import __version__
-from coldloop.config import selected
-from coldloop.errors import UsageError
+from coldloop import __version__, config, errors
 from coldloop.kernels.cache import find_cache_folder
-from coldloop.process.lti_model import LtiModel
-from coldloop.process.lti_model import load as load_model
+from coldloop.process import lti_model
 from coldloop.process.settings import InputLimits
-from coldloop.registers import maps_of
-from coldloop.registers.codec import blank
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, SequenceHeader, Update, Verdict
-from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
+from coldloop.registers import codec, control_plc, maps_of, optimizer_plc
 from coldloop.safety.writers import InputSequence, with_checksum
 from coldloop.service.start import in_one_line, main
 from coldloop.text import held_file, parsed_json, read_bytes
@@ -69,18 +63,20 @@ class ExportedProgram(OptimizerProgram):
         UsageError: The library cannot be loaded.
     """
 
-    def __init__(self, library: Path, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
+    def __init__(
+        self, library: Path, model: lti_model.LtiModel, settings: ProgramSettings, limits: InputLimits
+    ) -> None:
         try:
             self._c = CDLL(str(library))
         except OSError as error:
-            raise UsageError(f"the exported optimiser cannot be loaded: {error}") from None
+            raise errors.UsageError(f"the exported optimiser cannot be loaded: {error}") from None
         for name in ("optimizer_restart", "optimizer_plan", "optimizer_solve"):
             getattr(self._c, name).restype = c_bool
         self._c.optimizer_answered.argtypes = [c_bool]
         inputs, values = len(model.u0), 2 * len(model.u0) + len(model.y0) + len(model.x0)
         self._update = np.zeros(1, [("numbers", "i4", 3), ("reals", "f4", 1 + values)])
         self._planned = np.zeros(1, [("ticks", "i4", 2), ("reals", "f4", 2), ("more", "i4", 2)])
-        self._sequenced = np.zeros(1, [("numbers", "i4", 5), ("rows", "f4", (SEQUENCE_ROWS, inputs))])
+        self._sequenced = np.zeros(1, [("numbers", "i4", 5), ("rows", "f4", (control_plc.SEQUENCE_ROWS, inputs))])
         self._reported = np.zeros(1, [("numbers", "i4", 5), ("reals", "f4", 11)])
         super().__init__(model, settings, limits)
 
@@ -89,7 +85,7 @@ class ExportedProgram(OptimizerProgram):
         super().restart(updating_period_s, rule)
         self._c.optimizer_restart(round(updating_period_s / self.process.tick_s))
 
-    def plan(self, update: Update) -> Plan:
+    def plan(self, update: control_plc.Update) -> control_plc.Plan:
         """Take an update and decide the updating period that begins there.
 
         Raises UsageError if a tick or a number is beyond what the export holds.
@@ -97,9 +93,9 @@ class ExportedProgram(OptimizerProgram):
         self._update["numbers"] = np.array((update.update, update.tick, update.playing)).astype(np.int32)
         self._update["reals"] = (update.load, *update.u_before, *update.u, *update.y, *update.x)
         if not self._c.optimizer_plan(self._update.ctypes, self._planned.ctypes):
-            raise UsageError("a tick or a number is beyond what its 32 bits hold: begin another session")
+            raise errors.UsageError("a tick or a number is beyond what its 32 bits hold: begin another session")
         (_, next_update_tick), (load_step, shortage), (suspects, _) = (part.tolist() for part in self._planned[0])
-        return Plan(update.update, next_update_tick, load_step, shortage, suspects)
+        return control_plc.Plan(update.update, next_update_tick, load_step, shortage, suspects)
 
     def answer_after_s(self) -> float:
         """Return the plant time from the instant of the last `plan` until the PLC has computed its answer."""
@@ -109,26 +105,26 @@ class ExportedProgram(OptimizerProgram):
         """Compute the sequence that follows the last plan; without rows there is no answer."""
         self._c.optimizer_solve(self._sequenced.ctypes)
         number, update, first_tick, length, tau_u = self._sequenced[0]["numbers"].tolist()
-        header = SequenceHeader(number, update, first_tick, length, tau_u, self.model_digest, crc=0)
+        header = control_plc.SequenceHeader(number, update, first_tick, length, tau_u, self.model_digest, crc=0)
         return with_checksum(header, list(map(tuple, self._sequenced[0]["rows"][:length].tolist())))
 
     def answered(self, *, late: bool) -> None:
         """Note how an answer came."""
         self._c.optimizer_answered(late)
 
-    def report(self, verdict: Verdict) -> Optimization:
+    def report(self, verdict: control_plc.Verdict) -> optimizer_plc.Optimization:
         """Return what was done with the last update."""
         self._c.optimizer_report(self._reported.ctypes)
         numbers, reals = (part.tolist() for part in self._reported[0])
-        return Optimization._make((*numbers, verdict, *reals))
+        return optimizer_plc.Optimization._make((*numbers, verdict, *reals))
 
-    def predictor(self) -> Callable[[], Prediction]:
+    def predictor(self) -> Callable[[], optimizer_plc.Prediction]:
         """Return what gives no prediction."""
-        return partial(blank, Prediction, maps_of(self.process).optimizer_plc)
+        return partial(codec.blank, optimizer_plc.Prediction, maps_of(self.process).optimizer_plc)
 
-    def model_deviation(self) -> ModelDeviation:
+    def model_deviation(self) -> optimizer_plc.ModelDeviation:
         """Return no deviation."""
-        return blank(ModelDeviation, maps_of(self.process).optimizer_plc)
+        return codec.blank(optimizer_plc.ModelDeviation, maps_of(self.process).optimizer_plc)
 
 
 # -- an export for a run -----------------------------------------------------------------------------------------------
@@ -154,10 +150,10 @@ def manifest_of(settings: Settings, texts: Mapping[str, str], cost: Mapping[str,
 
 
 def _identity(settings: Settings) -> dict[str, Any]:
-    shown = selected(settings, SHOWN)
+    shown = config.selected(settings, SHOWN)
     del shown["optimizer_plc.program.updating_period_s"]  # the session's
     return {
-        "model_digest": load_model(settings.model.file).digest,
+        "model_digest": lti_model.load(settings.model.file).digest,
         "register_maps": [each.digest for each in maps_of(settings.process)[1:]],
         "settings": parsed_json(json.dumps(shown)),
     }
@@ -174,8 +170,8 @@ def exported_optimizer(given: str, settings: Settings) -> tuple[str, ...]:
         UsageError: It is none, or of another model or other settings, or cannot be compiled, or fails its self-test.
     """
 
-    def refusal(why: str) -> UsageError:
-        return UsageError(f"--optimizer {given}: {why}")
+    def refusal(why: str) -> errors.UsageError:
+        return errors.UsageError(f"--optimizer {given}: {why}")
 
     if not given.startswith(PREFIX):
         raise refusal("give export: and the folder that coldloop export plc --target c wrote")
@@ -183,7 +179,7 @@ def exported_optimizer(given: str, settings: Settings) -> tuple[str, ...]:
     return (*PYTHON, "-m", "coldloop_export.exported_optimizer", str(_compiled(refusal, sources)))
 
 
-Refusal: TypeAlias = Callable[[str], UsageError]
+Refusal: TypeAlias = Callable[[str], errors.UsageError]
 
 
 def _checked(refusal: Refusal, folder: Path, settings: Settings) -> dict[str, bytes]:
@@ -191,7 +187,7 @@ def _checked(refusal: Refusal, folder: Path, settings: Settings) -> dict[str, by
     try:
         manifest = held_file(folder, f"{FOLDER}/{MANIFEST}", "export it again")
         found = _Manifest.model_validate(parsed_json(read_bytes(manifest, "export it again", most=MOST_BYTES)))
-    except (UsageError, ValueError):
+    except (errors.UsageError, ValueError):
         solver = (folder / "kernels.c").exists() or (folder / "kernels.st").exists()
         what = "has the solver alone, without the optimiser: export it again" if solver else "is no export"
         raise refusal(f"{what} (coldloop export plc --target c --out FOLDER)") from None

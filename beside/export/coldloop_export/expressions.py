@@ -14,8 +14,7 @@ from typing import Any, ClassVar, Final, TypeAlias, TypeGuard, cast
 
 import numpy as np
 
-from coldloop.kernels.compiled import python_of
-from coldloop.kernels.single_precision import single
+from coldloop.kernels import compiled, single_precision
 from coldloop_export import tree
 from coldloop_export.tree import ArrayType, Expression, Field, Kind, Literal, Name, Operation, RowsType, View
 
@@ -27,7 +26,7 @@ class Source:
     """Syntax tree of a kernel, with what its names mean where it was written."""
 
     def __init__(self, function: Kernel) -> None:
-        python = python_of(function) or function
+        python = compiled.python_of(function) or function
         self.name = python.__name__
         self.file = inspect.getsourcefile(python) or python.__module__
         lines, first = inspect.getsourcelines(python)
@@ -73,7 +72,7 @@ COMPARISONS: Final[dict[type[ast.cmpop], str]] = {
 FUNCTIONS: Final[dict[object, str]] = {
     abs: "abs", min: "min", max: "max", np.sqrt: "sqrt", math.sqrt: "sqrt", np.isfinite: "isfinite",
     math.isfinite: "isfinite", np.isinf: "isinf", math.isnan: "isnan", math.log: "log", math.copysign: "copysign",
-    round: "round", single: "single",
+    round: "round", single_precision.single: "single",
 }  # fmt: skip
 OPERANDS: Final = {"min": 2, "max": 2, "copysign": 2}
 """Least number of operands of functions that take more than one."""

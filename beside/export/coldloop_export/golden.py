@@ -14,18 +14,15 @@ from typing import Any, Final, NamedTuple, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from coldloop.config import load_configuration
-from coldloop.errors import UsageError
+from coldloop import config, errors
 from coldloop.kernels.single_precision import single
 from coldloop.process.lti_model import load as load_model
 from coldloop.process.settings import InputLimits
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import SEQUENCE_ROWS, Plan, Update, control_map
+from coldloop.registers import codec, control_plc
 from coldloop.safety.writers import InputSequence
 from coldloop_control_plc import output_limits
 from coldloop_control_plc.output_limits import Limits, admit, begin, beginning, copy_state, in_range, judge, plain
-from coldloop_export.statements import Program
-from coldloop_export.tree import ArrayType, Function, Kind, Type, type_of
+from coldloop_export import statements, tree
 from coldloop_optimizer_plc import computing_settings, decisions, rules, scheme
 from coldloop_optimizer_plc.program import OptimizerProgram
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
@@ -34,9 +31,8 @@ from coldloop_optimizer_plc.settings import ProgramSettings, SolverName
 from coldloop_optimizer_plc.solvers.interface import KERNELS, Answer, Costs, solve_by
 from coldloop_optimizer_plc.solvers.ode import OdeMethod, solve
 from coldloop_plant.load import find_load
+from coldloop_rig.cosim import one_process, scenario
 from coldloop_rig.cosim.compiled.loops import PORTABLE
-from coldloop_rig.cosim.one_process import OneProcessRig
-from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.results.recording import Recorder
 from coldloop_rig.settings import Settings
 
@@ -53,9 +49,11 @@ class OdeProgram:
         self.method, self.problem, self.counts = method, problem, counts
         real = problem.phi.dtype.type
         none = Costs(real(np.inf), real(np.inf))
-        self.types: tuple[Type, ...] = tuple(map(type_of, (method, problem, np.zeros_like(problem.phi), counts, none)))
-        program = Program(frozenset({"power"}))  # the step size has a cube root by `**`
-        self.entry: Function = program.function(solve, self.types)
+        self.types: tuple[tree.Type, ...] = tuple(
+            map(tree.type_of, (method, problem, np.zeros_like(problem.phi), counts, none))
+        )
+        program = statements.Program(frozenset({"power"}))  # the step size has a cube root by `**`
+        self.entry: tree.Function = program.function(solve, self.types)
         self.functions = program.functions
         """Callees before their callers."""
 
@@ -101,9 +99,9 @@ class OptimizerKernels:
             cast("Callable[..., Any]", of): {kind.__name__: kernel for kind, kernel in kernels.items()}
             for of, kernels in ((solve_by, KERNELS), (rules.decide_by, rules.DECISIONS))
         }
-        program = Program(frozenset({"power", "log"}), generic)  # that root, and the logarithms of the rules
-        self.entries: list[Function] = [
-            program.function(kernel, tuple(map(type_of, given)))
+        program = statements.Program(frozenset({"power", "log"}), generic)  # that root, and the logarithms of the rules
+        self.entries: list[tree.Function] = [
+            program.function(kernel, tuple(map(tree.type_of, given)))
             for kernel, given in (
                 (decisions.begin_session, (c, m)),
                 (decisions.take_update, (c, self.rules[0], self.starts[0], m, latched)),
@@ -113,7 +111,9 @@ class OptimizerKernels:
         ]
         self.functions = program.functions
         """Callees before their callers."""
-        self.types: tuple[Type, ...] = tuple(parameter.type for each in self.functions for parameter in each.parameters)
+        self.types: tuple[tree.Type, ...] = tuple(
+            parameter.type for each in self.functions for parameter in each.parameters
+        )
 
 
 class GuardKernels:
@@ -121,20 +121,20 @@ class GuardKernels:
 
     def __init__(self, limits: InputLimits) -> None:
         self.limits = plain(limits)
-        state = type_of(beginning(self.limits, self.limits.low))
-        n, tick, of = len(self.limits.low), Kind.INT, type_of(self.limits)
-        row, rows = ArrayType(Kind.REAL, (n,)), ArrayType(Kind.REAL, (SEQUENCE_ROWS, n))
-        program = Program(portable=frozenset(PORTABLE), double=True)
+        state = tree.type_of(beginning(self.limits, self.limits.low))
+        n, tick, of = len(self.limits.low), tree.Kind.INT, tree.type_of(self.limits)
+        row, rows = tree.ArrayType(tree.Kind.REAL, (n,)), tree.ArrayType(tree.Kind.REAL, (control_plc.SEQUENCE_ROWS, n))
+        program = statements.Program(portable=frozenset(PORTABLE), double=True)
         self.begin, self.resume, self.admit, self.judge, self.in_range = self.entries = tuple(
             program.function(function, types) for function, types in (
                 (output_limits.begin, (state, of, row)),
                 (output_limits.resume, (state, of, tick, row)),
-                (output_limits.admit, (state, of, tick, row, Kind.BOOL)),
+                (output_limits.admit, (state, of, tick, row, tree.Kind.BOOL)),
                 (output_limits.judge, (state, state, of, tick, rows, tick, tick, tick, rows, tick)),
                 (output_limits.in_range, (of, row)),
             )
         )  # fmt: skip
-        self.functions: list[Function] = program.functions
+        self.functions: list[tree.Function] = program.functions
         """Callees before their callers."""
 
 
@@ -179,7 +179,7 @@ class GoldenVectors(NamedTuple):
 def paper_settings(model: Path) -> Settings:
     """Return the settings of the paper's PLC with a model file."""
     options = {"model.file": (str(model), "model")}
-    return load_configuration(Settings, environment={}, assignments=SINGLE, options=options).settings
+    return config.load_configuration(Settings, environment={}, assignments=SINGLE, options=options).settings
 
 
 def record(settings: Settings, ticks: int = TICKS, load: str = LOAD) -> GoldenVectors:
@@ -207,8 +207,8 @@ class GoldenUpdate(NamedTuple):
 
     fixed_ticks: int
     """Fixed updating period (ticks) of the session that begins with this update; -1 within a session."""
-    update: Update
-    plan: Plan
+    update: control_plc.Update
+    plan: control_plc.Plan
     sequence: InputSequence | None
     """Sequence of the answer; None if the update was interrupted before."""
 
@@ -235,9 +235,9 @@ def update_tables(golden: Sequence[GoldenUpdate]) -> dict[str, Array]:
 def refuse(settings: ProgramSettings) -> None:
     """Refuse a solver or an arithmetic that cannot be exported. Raises UsageError."""
     if settings.solver is not SolverName.ODE:
-        raise UsageError("export plc: with the ODE-based solver alone: --set optimizer_plc.program.solver=ode")
+        raise errors.UsageError("export plc: with the ODE-based solver alone: --set optimizer_plc.program.solver=ode")
     if settings.arithmetic is not computing_settings.Arithmetic.FLOAT32:
-        raise UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
+        raise errors.UsageError("export plc: in single precision alone: --set optimizer_plc.program.arithmetic=float32")
 
 
 class _ListeningOptimizer(OptimizerProgram):
@@ -250,10 +250,12 @@ class _ListeningOptimizer(OptimizerProgram):
         self._begun = round(updating_period_s / self.process.tick_s)
         super().restart(updating_period_s, rule)
 
-    def plan(self, update: Update) -> Plan:
+    def plan(self, update: control_plc.Update) -> control_plc.Plan:
         """Keep the update and its plan."""
         plan = super().plan(update)
-        self.updates.append(GoldenUpdate(self._begun, update, as_transmitted(plan, control_map(self.process)), None))
+        self.updates.append(
+            GoldenUpdate(self._begun, update, codec.as_transmitted(plan, control_plc.control_map(self.process)), None)
+        )
         self._begun = -1
         return plan
 
@@ -275,13 +277,13 @@ class UpdateRecorder:
         refuse(settings.optimizer_plc.program)
         self._model = load_model(settings.model.file)
         self.optimizer = _ListeningOptimizer(self._model, settings.optimizer_plc.program, settings.limits)
-        self._rig = OneProcessRig(settings, compiled=False)
+        self._rig = one_process.OneProcessRig(settings, compiled=False)
         self._rig.optimizer = self.optimizer
 
     def record(self, ticks: int, load: str, updating_period_s: float) -> list[GoldenUpdate]:
         """Return the updates of a run of so many ticks under a named load."""
         profile = find_load(load, self._model.w0, self.optimizer.process)
-        self._rig.run(Scenario(ticks, profile, updating_period_s, seed=1), Recorder(ticks, []))
+        self._rig.run(scenario.Scenario(ticks, profile, updating_period_s, seed=1), Recorder(ticks, []))
         return self.optimizer.updates
 
     def problems(self) -> GoldenVectors:
@@ -355,7 +357,7 @@ class _Drawing:
 
     def __init__(self, limits: Limits, source: random.Random) -> None:
         self.limits, self.random, self._n = limits, source, len(limits.low)
-        self._longest = min(SEQUENCE_ROWS, MOST_NUMBERS // (10 * self._n))
+        self._longest = min(control_plc.SEQUENCE_ROWS, MOST_NUMBERS // (10 * self._n))
         """Rows of a sequence that is judged."""
         self.state = beginning(limits, self._row(0.2, 0.8))
         self.twin = beginning(limits, self.state.applied)

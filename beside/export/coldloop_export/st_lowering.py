@@ -11,8 +11,7 @@ from dataclasses import replace
 from types import MappingProxyType
 from typing import Final, NamedTuple, TypeAlias, cast
 
-from coldloop_export import tree
-from coldloop_export.expressions import ZERO, added
+from coldloop_export import expressions, tree
 from coldloop_export.tree import ArrayType, Assign, Element, Expression, If, Kind, Literal, Name, Operation, Path
 
 
@@ -76,7 +75,7 @@ def part_of(place: Place, name: str, kind: tree.Type) -> Place:
             return Rows((*path, name), kind.length)
         case Record(path):
             named = Name(kind, dotted((*path, name)))
-            return Part(named, ZERO) if isinstance(kind, ArrayType) else named
+            return Part(named, expressions.ZERO) if isinstance(kind, ArrayType) else named
         case Entry((path, length), at) if isinstance(kind, tree.RecordType):
             return Entry(Rows((*path, name), length), at)
         case Entry() if isinstance(kind, Kind):
@@ -323,7 +322,7 @@ class FunctionLowering:
     def _place(self, expression: Expression) -> Place:
         match expression:
             case Name(kind, name):
-                unbound = Part(expression, ZERO) if isinstance(kind, ArrayType) else expression
+                unbound = Part(expression, expressions.ZERO) if isinstance(kind, ArrayType) else expression
                 return self.places.get(name, unbound)
             case tree.Field(kind, record, name):
                 whole = self._place(record)
@@ -352,7 +351,7 @@ class FunctionLowering:
         whole, offset = cast("Part", self._place(array))
         if tuple(whole.name.split(".")) in self.lowering.split:
             raise tree.UnfitKernelError(f"{self.function.source}: {whole.name} is in pieces; take a part of it first")
-        if offset == ZERO and whole.type == array.type:
+        if offset == expressions.ZERO and whole.type == array.type:
             return Element(kind, whole, indices)
         return Element(kind, tree.View(cast("ArrayType", array.type), whole, offset), indices)
 
@@ -361,7 +360,7 @@ class FunctionLowering:
         whole, before = cast("Part", place)
         pieces = self.lowering.split.get(tuple(whole.name.split(".")))
         if not pieces:
-            return Part(whole, self._captured(added(before, offset)))
+            return Part(whole, self._captured(expressions.added(before, offset)))
         copy = self._temporary(ArrayType(kind.kind, (kind.size,)), "part")
         statements: tuple[tree.Statement, ...] = ()
         first = 0
@@ -370,12 +369,12 @@ class FunctionLowering:
             within = Operation(Kind.INT, "-", (offset, Literal(Kind.INT, first)))
             source = Element(kind.kind, piece, (Operation(Kind.INT, "+", (within, at)),))
             taken = Assign(Element(kind.kind, copy, (at,)), self._noted(source))
-            loop = tree.Count(at, ZERO, Literal(Kind.INT, kind.size - 1), 1, (taken,))
+            loop = tree.Count(at, expressions.ZERO, Literal(Kind.INT, kind.size - 1), 1, (taken,))
             behind = Operation(Kind.BOOL, ">=", (offset, Literal(Kind.INT, first)))
             statements = (If(behind, (loop,), statements),) if statements else (loop,)
             first += size
         self.before += statements
-        return Part(copy, ZERO)
+        return Part(copy, expressions.ZERO)
 
     def _captured(self, number: Expression) -> Expression:
         """Return a number that stays as it is now."""
@@ -413,7 +412,7 @@ def zeroed(array: Name) -> tree.Count:
     kind = cast("ArrayType", array.type)
     at, row = Name(Kind.INT, "at.0"), Name(ArrayType(kind.kind, (kind.size,)), array.name)
     zero = Assign(Element(kind.kind, row, (at,)), Literal(kind.kind, 0))
-    return tree.Count(at, ZERO, Literal(Kind.INT, kind.size - 1), 1, (zero,))
+    return tree.Count(at, expressions.ZERO, Literal(Kind.INT, kind.size - 1), 1, (zero,))
 
 
 def size_of(kind: tree.Type) -> tuple[Kind, int]:

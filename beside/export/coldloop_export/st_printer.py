@@ -10,8 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from coldloop_export import st_lowering, tree
-from coldloop_export.golden import Array
+from coldloop_export import golden, st_lowering, tree
 from coldloop_export.tree import ArrayType, Block, Call, Convert, Kind, Name, Path, Statement, Type, type_of
 from coldloop_rig.text_tables import markdown_table
 
@@ -325,7 +324,7 @@ class Constants:
     Not every tool takes `VAR_EXTERNAL CONSTANT`, which would have to go with `VAR_GLOBAL CONSTANT`.
     """
 
-    def __init__(self, values: Mapping[Path, Array], printer: StructuredTextPrinter) -> None:
+    def __init__(self, values: Mapping[Path, golden.Array], printer: StructuredTextPrinter) -> None:
         self.values, self.printer = values, printer
 
     def _weighed(self, of_real: int, of_integer: int) -> list[int]:
@@ -352,7 +351,7 @@ class Constants:
             found[name] = (self.printer.type(type_of(values[()])), self.value(values))
         return found
 
-    def value(self, values: Array) -> str:
+    def value(self, values: golden.Array) -> str:
         """Return a number, or an array as an initialiser; one without elements has a zero."""
         if values.dtype.kind == "b":
             return "TRUE" if values else "FALSE"
@@ -401,7 +400,7 @@ class Constants:
                                  in enumerate(zip(declared, (None, *self.values.values()), strict=True))).rstrip(),
         }  # fmt: skip
 
-    def _item(self, part: int, name: str, values: Array | None) -> str:
+    def _item(self, part: int, name: str, values: golden.Array | None) -> str:
         pad = " " * 20
         if values is not None and values.dtype.kind == "b":
             read = f"IF {name} THEN\n{pad}    item := 1;\n{pad}ELSE\n{pad}    item := 0;\n{pad}END_IF;"
@@ -420,9 +419,9 @@ def configuration(lists: Iterable[str]) -> str:
     return tree.filled(tree.template("structured_text/configuration.st"), {"LISTS": "".join(lists)})
 
 
-def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], st_lowering.Split]:
+def in_pieces(constants: Mapping[Path, golden.Array]) -> tuple[dict[Path, golden.Array], st_lowering.Split]:
     """Return constants with those that are larger than a list in pieces of whole rows; and which these are."""
-    found: dict[Path, Array] = {}
+    found: dict[Path, golden.Array] = {}
     split: dict[Path, list[tuple[Path, int]]] = {}
     for path, values in constants.items():
         rows = LARGEST_LIST // (4 * values[0].size) if values.ndim > 1 and values.size else 0
@@ -435,17 +434,17 @@ def in_pieces(constants: Mapping[Path, Array]) -> tuple[dict[Path, Array], st_lo
     return found, split
 
 
-def types_in(values: Mapping[Path, Array]) -> dict[Path, Type]:
+def types_in(values: Mapping[Path, golden.Array]) -> dict[Path, Type]:
     """Return the types of constants."""
     return {path: type_of(each[()]) for path, each in values.items()}
 
 
-def scalar_of(values: Array) -> str:
+def scalar_of(values: golden.Array) -> str:
     """Return the type of an array's elements."""
     return "REAL" if values.dtype.kind == "f" else "DINT"
 
 
-def sum_of(values: Array, before: int = 0, *, double: bool = False) -> int:
+def sum_of(values: golden.Array, before: int = 0, *, double: bool = False) -> int:
     """Return the sum over numbers that the self-test computes: no change of one bit leaves it as it is."""
     if values.dtype.kind == "f" and double:
         items = np.array([item for value in values.ravel().tolist() for item in bits_of_double(value)])

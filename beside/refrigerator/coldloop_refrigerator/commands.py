@@ -19,19 +19,17 @@ def _declare(parser: argparse.ArgumentParser) -> None:
 def execute_exergy(options: argparse.Namespace) -> int:
     """Specific power of a refrigerator at rest, and where the exergy that it is given is lost."""
     from coldloop.errors import UsageError
-    from coldloop_plant.equilibrium import NoEquilibriumError
-    from coldloop_plant.helium import load_helium
+    from coldloop_plant import equilibrium, helium
+    from coldloop_refrigerator import model, plant_file
     from coldloop_refrigerator.exergy import exergy_balance
-    from coldloop_refrigerator.model import refrigerator_operating_point
-    from coldloop_refrigerator.plant_file import read_refrigerator
 
     settings = configuration(options).settings
-    file = read_refrigerator(options.plant, settings.limits)
+    file = plant_file.read_refrigerator(options.plant, settings.limits)
     try:
-        rest, _ = refrigerator_operating_point(file, load_helium(), settings.plant.station.weights)
-    except NoEquilibriumError as error:
+        rest, _ = model.refrigerator_operating_point(file, helium.load_helium(), settings.plant.station.weights)
+    except equilibrium.NoEquilibriumError as error:
         raise UsageError(f"{options.plant or 'the reference refrigerator'}: {error}") from None
-    balance = exergy_balance(rest, file.refrigerator, load_helium())
+    balance = exergy_balance(rest, file.refrigerator, helium.load_helium())
     of_all, of_electricity = (100.0 * balance.useful / each for each in (balance.put_in, balance.electricity))
     lines = [
         f"cold power {balance.cold_power:.1f} W at {balance.T_bath:.3f} K, load and heater",

@@ -20,8 +20,7 @@ from coldloop.process.lti_model import LtiModel
 from coldloop.service import add_configuration_options
 from coldloop.service.start import SECTIONS
 from coldloop_plant.cold_box import model as cold_box
-from coldloop_plant.cold_box import streams
-from coldloop_plant.cold_box.plant_file import OPERATING_INPUTS, OPERATING_LEVEL
+from coldloop_plant.cold_box import plant_file, streams
 from coldloop_plant.equilibrium import Linear, Modes, NoEquilibriumError, complex_step, model_of, newton
 from coldloop_plant.helium import Helium, load_helium
 from coldloop_plant.numeric import PA_PER_BAR, Array, RealArray
@@ -199,7 +198,9 @@ def make_refrigerator_file(
     """
     helium, weights = load_helium(), weights or LqWeights()
     if rest is None:
-        cold = cold_box.find_equilibrium(np.array(OPERATING_INPUTS), OPERATING_LEVEL, plant.box, helium)
+        cold = cold_box.find_equilibrium(
+            np.array(plant_file.OPERATING_INPUTS), plant_file.OPERATING_LEVEL, plant.box, helium
+        )
         rest = find_refrigerator_equilibrium(cold, plant, helium)
     J = jacobian(rest.x, rest.u, rest.v, rest.d, plant, helium)
     first, second = lq_gains(J, plant.station.actuator.lag, weights).tolist()

@@ -16,10 +16,7 @@ from coldloop.process.cold_box import INPUT_NAMES, TICK_S
 from coldloop_plant.helium import load_helium
 from coldloop_plant.numeric import RealArray
 from coldloop_plant.settings import StationControlKind, StationSettings
-from coldloop_refrigerator.physics import COMMAND_NAMES, SIGNAL_NAMES, STATE_NAMES, advance_refrigerator, evaluated
-from coldloop_refrigerator.plant_file import REFERENCE_REFRIGERATOR
-from coldloop_refrigerator.program import SHIPPED, RefrigeratorFile, read_refrigerator_file
-from coldloop_refrigerator.station_control import MEMORY_SIZE, StationMeasurement, control_station, station_law
+from coldloop_refrigerator import physics, plant_file, program, station_control
 
 LOAD: Final = "load"
 STEPS: Final = (
@@ -29,9 +26,9 @@ STEPS: Final = (
 """Stepped signals and the sizes of their steps: openings in %, heater and load in W."""
 SETTLED_BAR: Final = (0.01, 0.001)  # High and low pressure have settled when they stay within these of their last value
 AMBIENT_K: Final = 300.0
-PRESSURES: Final = tuple(SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
-BUFFER, NITROGEN = (SIGNAL_NAMES.index(name) for name in ("P13", "L_N2"))
-OPENINGS: Final = tuple(STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
+PRESSURES: Final = tuple(physics.SIGNAL_NAMES.index(name) for name in ("P12", "P11"))
+BUFFER, NITROGEN = (physics.SIGNAL_NAMES.index(name) for name in ("P13", "L_N2"))
+OPENINGS: Final = tuple(physics.STATE_NAMES.index(name) for name in ("CV956", "CV952", "CV953"))
 
 
 class Response(NamedTuple):
@@ -57,45 +54,45 @@ def response_of(deviations: RealArray, band: float, tick_s: float = TICK_S) -> R
 
 
 def pressures_after(
-    name: str, size: float, control: StationControlKind | None, seconds: float, file: RefrigeratorFile
+    name: str, size: float, control: StationControlKind | None, seconds: float, file: program.RefrigeratorFile
 ) -> RealArray:
     """Let an input, a valve of the station or `LOAD` step by a size (% or W); return both pressures, (N, 2), bar.
 
     Without `control` the openings stay those of the operating point.
     """
-    plant, helium = REFERENCE_REFRIGERATOR, load_helium()
-    u, added = np.array(file.u0, dtype=np.float64), np.zeros(len(COMMAND_NAMES))
+    plant, helium = plant_file.REFERENCE_REFRIGERATOR, load_helium()
+    u, added = np.array(file.u0, dtype=np.float64), np.zeros(len(physics.COMMAND_NAMES))
     d = np.array([file.w0, AMBIENT_K, 0.0, 1.0, 1.0, 1.0])
     x, v = np.array(file.x0), np.array(file.v0, dtype=np.float64)
-    _, _, signals = evaluated(x, u, v, d, plant, helium)
+    _, _, signals = physics.evaluated(x, u, v, d, plant, helium)
     if name == LOAD:
         d[0] += size
     elif name in INPUT_NAMES:
         u[INPUT_NAMES.index(name)] += size
     else:
-        added[COMMAND_NAMES.index(name)] = size
-    settings, memory = StationSettings(control=control or StationControlKind.LQ), np.zeros(MEMORY_SIZE)
-    law = station_law(settings, file.gains, file.v0, plant.station)
+        added[physics.COMMAND_NAMES.index(name)] = size
+    settings, memory = StationSettings(control=control or StationControlKind.LQ), np.zeros(station_control.MEMORY_SIZE)
+    law = station_control.station_law(settings, file.gains, file.v0, plant.station)
     rows = np.empty((round(seconds / TICK_S), len(PRESSURES)))
     for row in rows:
         row[:] = signals[list(PRESSURES)]
         if control is not None:
             hp, lp, buffer, nitrogen = signals[[*PRESSURES, BUFFER, NITROGEN]].tolist()
             bypass, discharge, charge = x[list(OPENINGS)].tolist()
-            measured = StationMeasurement(
+            measured = station_control.StationMeasurement(
                 hp, lp, buffer, bypass, discharge, charge, nitrogen, lost=0.0, bath=1.23, nc1=True, nc2=True,
                 loaded=2, turbine=True, overspeed=False, deviating=False, suction=False,
             )  # fmt: skip
-            v = np.array(control_station(law, memory, measured)[0])
+            v = np.array(station_control.control_station(law, memory, measured)[0])
         opened = np.clip(v + added, 0.0, 100.0)
-        x = advance_refrigerator(x, u, opened, d, TICK_S, plant, helium)
-        _, _, signals = evaluated(x, u, opened, d, plant, helium)
+        x = physics.advance_refrigerator(x, u, opened, d, TICK_S, plant, helium)
+        _, _, signals = physics.evaluated(x, u, opened, d, plant, helium)
     return rows
 
 
 def table(seconds: float, steps: Sequence[tuple[str, float]] = STEPS) -> list[str]:
     """Return the responses to all steps in open loop, with LQ and with PI, as lines of a Markdown table."""
-    file = read_refrigerator_file(SHIPPED)
+    file = program.read_refrigerator_file(program.SHIPPED)
     lines = [
         "| step | control | HP: peak, mbar | overshoot | settled, s | LP: peak, mbar | overshoot | settled, s |",
         "|---|---|---|---|---|---|---|---|",

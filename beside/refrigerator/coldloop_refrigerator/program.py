@@ -18,26 +18,20 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from pydantic import BaseModel, ValidationError
 
-from coldloop.config import explained
-from coldloop.errors import ConfigurationError, ModelFileError
+from coldloop import config, errors
 from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.intrinsics import plain_tuples
-from coldloop.process.cold_box import TICK_S, present_model_range
-from coldloop.process.lti_model import COLD_BOX, FORMAT, LtiModel, ModelHeader, read_document, write_document
+from coldloop.process import cold_box, lti_model
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
-from coldloop_plant import settings
+from coldloop_plant import kinds, numeric, program, settings
 from coldloop_plant.cold_box import ColdBox, ColdBoxProgram
 from coldloop_plant.cold_box.model import AtRest, parameters_digest
 from coldloop_plant.cold_box.plant_file import REFERENCE, PlantFile
 from coldloop_plant.components.phase_separator import SUPERHEAT, content
 from coldloop_plant.helium import Helium, load_helium, saturation, vapour_enthalpy_and_cp
-from coldloop_plant.kinds import box_of, parameters_in
-from coldloop_plant.numeric import RealArray
-from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, NoiseOfSeed, PlantProgram
-from coldloop_refrigerator import physics, plant_file, tick
+from coldloop_refrigerator import physics, plant_file, station_control, tick
 from coldloop_refrigerator.physics import BOX_STATES, COMMAND_NAMES, STATE_NAMES, Refrigerator
 from coldloop_refrigerator.plant_file import KIND, REFERENCE_REFRIGERATOR
-from coldloop_refrigerator.station_control import station_law
 from coldloop_refrigerator.tick import RefrigeratorMemory
 from coldloop_refrigerator.warm import gas_mass
 
@@ -70,7 +64,7 @@ class RefrigeratorFile(BaseModel, frozen=True):
 
     def save(self, path: Path) -> None:
         """Write the file (OSError if it cannot be written)."""
-        write_document(path, {"format": FORMAT, "plant": KIND, **self.model_dump(mode="json")})
+        lti_model.write_document(path, {"format": lti_model.FORMAT, "plant": KIND, **self.model_dump(mode="json")})
 
 
 def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERATOR) -> RefrigeratorFile:
@@ -79,9 +73,9 @@ def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERA
     Raises:
         ModelFileError: The file cannot be read, is damaged, or was made from another plant.
     """
-    document = read_document(path, REMEDY)
+    document = lti_model.read_document(path, REMEDY)
     if document.get("plant") != KIND:
-        raise ModelFileError(f"{path}: not the file of a refrigerator; {REMEDY}")
+        raise errors.ModelFileError(f"{path}: not the file of a refrigerator; {REMEDY}")
     return rest_in(document, plant, str(path))
 
 
@@ -94,13 +88,13 @@ def rest_in(document: dict[str, Any], plant: Refrigerator, path: str) -> Refrige
     try:
         file = RefrigeratorFile.model_validate(document)
     except ValidationError as error:
-        wrong = explained(error, {}, RefrigeratorFile, "the file is incomplete")
-        raise ModelFileError(f"{path}: {wrong}; {REMEDY}") from error
+        wrong = config.explained(error, {}, RefrigeratorFile, "the file is incomplete")
+        raise errors.ModelFileError(f"{path}: {wrong}; {REMEDY}") from error
     names, sizes = (file.state_names, file.command_names), list(map(len, (file.x0, file.u0, file.v0, *file.gains)))
     if names != (STATE_NAMES, COMMAND_NAMES) or sizes != [len(STATE_NAMES), 3, len(COMMAND_NAMES), 6, 6]:
-        raise ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
+        raise errors.ModelFileError(f"{path}: made for a refrigerator with other states; {REMEDY}")
     if file.parameters_digest != refrigerator_digest(plant):
-        raise ModelFileError(f"{path}: made for a refrigerator with other parameters; {REMEDY}")
+        raise errors.ModelFileError(f"{path}: made for a refrigerator with other parameters; {REMEDY}")
     return file
 
 
@@ -117,7 +111,7 @@ def refrigerator_digest(plant: Refrigerator) -> str:
 
 def warm_state(
     rest: Sequence[float], plant: Refrigerator, helium: Helium, *, ambient: float, low_pressure: float
-) -> RealArray:
+) -> numeric.RealArray:
     """Return the state, shape (48,), of a warm refrigerator with as much helium as it holds at rest.
 
     No compressor runs. The low-pressure line is at its set point and the bath, a vessel of vapour, with it; what is
@@ -170,7 +164,7 @@ class EventSchedule:
 
     def ambient(self, tick: int) -> float:
         """Return the temperature of the surroundings (K) with the day's swing."""
-        swing = self._swing * sin(2.0 * pi * tick * TICK_S / 86_400.0) if self._swing else 0.0
+        swing = self._swing * sin(2.0 * pi * tick * cold_box.TICK_S / 86_400.0) if self._swing else 0.0
         return self.at(tick).ambient + swing
 
 
@@ -195,16 +189,18 @@ class RefrigeratorProgram(ColdBoxProgram):
         plant: Refrigerator = REFERENCE_REFRIGERATOR,
         file: RefrigeratorFile,
         u0: Sequence[float],
-        load: HeatLoad,
+        load: program.HeatLoad,
         station: settings.StationSettings,
         events: EventSchedule,
-        noise: MeasurementNoise | None = None,
+        noise: program.MeasurementNoise | None = None,
         seed: int = 0,
         warm: bool = False,
     ) -> None:
         self.plant = plant
         self._plant, self._tables = plain_tuples(plant), plain_tuples(load_helium())
-        self.law = station_law(station, file.gains, file.v0, plant.station)  # Control law of the station
+        self.law = station_control.station_law(
+            station, file.gains, file.v0, plant.station
+        )  # Control law of the station
         self._law = plain_tuples(self.law)
         self._events = events
         self._gauge_deviation, self._seed = station.noise_bar, seed
@@ -219,7 +215,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         tick.control_tick(self._memory, d, self.law)
         super().__init__(box=plant.box, x0=x[:BOX_STATES].tolist(), u0=u0, load=load, noise=noise)
 
-    def _read(self, w: float) -> RealArray:  # noqa: ARG002 what was read with the memory
+    def _read(self, w: float) -> numeric.RealArray:  # noqa: ARG002 what was read with the memory
         return self._memory.y
 
     def _warm_up(self) -> None:
@@ -237,7 +233,7 @@ class RefrigeratorProgram(ColdBoxProgram):
     def model_range(self) -> int:
         """Parts outside the property tables at the current tick, bits of `ModelRange`."""
         signals = self._memory.signals
-        return present_model_range(self._x, float(signals[tick.HP]), float(signals[tick.LP]))
+        return cold_box.present_model_range(self._x, float(signals[tick.HP]), float(signals[tick.LP]))
 
     @property
     def station_status(self) -> StationStatus:
@@ -264,7 +260,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         self.tick += 1
         self._measured = self._sample(self._memory.y)
 
-    def _disturbances(self, tick: int, w: float) -> RealArray:
+    def _disturbances(self, tick: int, w: float) -> numeric.RealArray:
         """Return what is given in a tick under a load `w` (W); the gauges' noise follows from tick and seed alone."""
         given, ambient, gauges = self._events.at(tick), self._events.ambient(tick), np.zeros(2)
         if self._gauge_deviation:
@@ -275,7 +271,7 @@ class RefrigeratorProgram(ColdBoxProgram):
         blocking = (given.blocked_nef1, given.blocked_nef2, given.blocked_nef34, given.blocked_nef6)
         return np.array([*physical, *gauges, *equipment, *blocking], dtype=np.float64)
 
-    def ahead(self, ticks: int) -> RealArray:
+    def ahead(self, ticks: int) -> numeric.RealArray:
         """Return the disturbances, without load, of `ticks` ticks and of the one behind them, shape (ticks + 1, 16)."""
         return np.array([self._disturbances(self.tick + later, 0.0) for later in range(ticks + 1)])
 
@@ -285,7 +281,9 @@ class RefrigeratorProgram(ColdBoxProgram):
         parts: dict[str, Any] = {name: part.copy() for name, part in self._memory._asdict().items()}
         return RefrigeratorMemory(**parts)
 
-    def take_over_whole(self, tick: int, u: RealArray, memory: RefrigeratorMemory, y: RealArray) -> None:
+    def take_over_whole(
+        self, tick: int, u: numeric.RealArray, memory: RefrigeratorMemory, y: numeric.RealArray
+    ) -> None:
         """Resume at another tick with what `memory` and `measure` would return there; `u` was held up to it."""
         self.take_over(tick, memory.x[:BOX_STATES], u, y)
         self._memory = memory
@@ -320,36 +318,40 @@ class RefrigeratorProgram(ColdBoxProgram):
 class RefrigeratorKind:
     """The refrigerator as a `coldloop_plant.kinds.Kind`."""
 
-    def plant_in(self, model: ModelHeader | LtiModel, where: str) -> tuple[ColdBox, str]:
+    def plant_in(self, model: lti_model.ModelHeader | lti_model.LtiModel, where: str) -> tuple[ColdBox, str]:
         """Return the cold box of the refrigerator that a model file describes, and the digest of its parameters."""
         plant = _refrigerator_in(model, where)
         return plant.box, refrigerator_digest(plant)
 
-    def maker_of(self, header: ModelHeader, section: settings.PlantSection, noise_of_seed: NoiseOfSeed) -> MakePlant:
+    def maker_of(
+        self, header: lti_model.ModelHeader, section: settings.PlantSection, noise_of_seed: program.NoiseOfSeed
+    ) -> program.MakePlant:
         """Return what makes the refrigerator of a model file, for a load and a seed.
 
         Raises:
             ModelFileError: The refrigerator's file, or what the model file says of the plant, cannot be used.
             ConfigurationError: Its gains are not of the configured weights.
         """
-        if header.plant == COLD_BOX and box_of(header) != REFERENCE:
-            raise ModelFileError("model.file: of another cold box than the refrigerator's; set plant.kind to cold-box")
+        if header.plant == lti_model.COLD_BOX and kinds.box_of(header) != REFERENCE:
+            raise errors.ModelFileError(
+                "model.file: of another cold box than the refrigerator's; set plant.kind to cold-box"
+            )
         plant, named = REFERENCE_REFRIGERATOR, section.refrigerator.file
-        if header.plant != COLD_BOX:
+        if header.plant != lti_model.COLD_BOX:
             plant = _refrigerator_in(header, "model.file")
         if named is None and header.plant_rest:
             file = rest_in(header.plant_rest, plant, "model.file: plant_rest")
         else:
             file = read_refrigerator_file(named or SHIPPED, plant)
         if section.station.control is settings.StationControlKind.LQ and section.station.weights != file.weights:
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 "plant.station.weights: the gains of this refrigerator belong to other weights; make a file with"
                 " `python -m coldloop_refrigerator.model FILE` and name it in plant.refrigerator.file, or, with a"
                 " plant file, its model file with `coldloop model --plant` and these weights"
             )
         happening = section.refrigerator
 
-        def make(load: HeatLoad, seed: int) -> PlantProgram:
+        def make(load: program.HeatLoad, seed: int) -> program.PlantProgram:
             events = EventSchedule(happening.events, happening.ambient_k, happening.daily_swing_k)
             with kernels_of("the refrigerator", about_s=20):
                 return RefrigeratorProgram(
@@ -368,5 +370,5 @@ class RefrigeratorKind:
         return described_at_rest(plant_file.RefrigeratorPlantFile.model_validate(file), control)
 
 
-def _refrigerator_in(model: ModelHeader | LtiModel, where: str) -> Refrigerator:
-    return parameters_in(model, plant_file.RefrigeratorParameters, where).refrigerator
+def _refrigerator_in(model: lti_model.ModelHeader | lti_model.LtiModel, where: str) -> Refrigerator:
+    return kinds.parameters_in(model, plant_file.RefrigeratorParameters, where).refrigerator

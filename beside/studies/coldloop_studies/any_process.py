@@ -14,8 +14,7 @@ from coldloop.process import cold_box, declaration
 from coldloop_rig.figures.plot import COLOURS
 from coldloop_rig.plc_sizing import intervals
 from coldloop_rig.text_tables import Cell, markdown_table
-from coldloop_studies import request, study
-from coldloop_studies.drawing import legend_outside, panels, ratio_rows, ratio_scale, spans_decade
+from coldloop_studies import drawing, request, study
 from coldloop_studies.settings import settings_of
 from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, StudyOptions, StudyResult, Variant, loads
 
@@ -81,11 +80,11 @@ def _variants_figure(variants: tuple[Variant, ...], ratios: list[intervals.Inter
     label = "geometric mean, 95 % interval"
     rows = {variant.name: ratio for variant, ratio in zip(variants[1:], ratios[1:], strict=True)}
     height_in = 1.2 + 0.35 * len(rows)
-    figure = ratio_rows(
+    figure = drawing.ratio_rows(
         {label: rows}, f"J_BF over that of {variants[0].name} (1); a mark for each draw", height_in, 0.25, 1
     )
     place = figure.axes[0]
-    if not spans_decade(by_draw):
+    if not drawing.spans_decade(by_draw):
         place.set_xscale("linear")
     for number, over in enumerate(by_draw[1:]):
         place.plot(over, np.full(len(over), number + 0.2), "|", color="#888888", markersize=5)
@@ -190,7 +189,7 @@ def _runs(load: Load, process: declaration.Process, settings: tuple[str, ...]) -
 def _periods_figure(costs: dict[str, Array], means: dict[str, float], fixed_s: tuple[float, ...]) -> Figure:
     """Draw, for each regime, each fixed period's cost over that of the adaptive one, and their geometric mean."""
     beside = min(2, len(costs))
-    with panels(len(costs) // beside, beside, 2.6 if beside == 1 else 4.4) as (figure, places):
+    with drawing.panels(len(costs) // beside, beside, 2.6 if beside == 1 else 4.4) as (figure, places):
         for place, (regime, by_period) in zip(places, costs.items(), strict=True):
             over = by_period[1:] / by_period[0]
             place.plot(fixed_s, over, "-", color=COLOURS[0], alpha=0.25, linewidth=0.8)
@@ -199,9 +198,9 @@ def _periods_figure(costs: dict[str, Array], means: dict[str, float], fixed_s: t
             )
             place.plot(means[regime], 1.0, "*", color=COLOURS[1], markersize=9, label="adaptive, at its mean period")
             place.axhline(1.0, color=COLOURS[1], linewidth=0.8)
-            ratio_scale(place, "y", over)
+            drawing.ratio_scale(place, "y", over)
             place.set_title(regime)
         figure.supxlabel("fixed period (s)", fontsize=8)
         figure.supylabel("$J^{BF}$ over that of the adaptive period (1)", fontsize=8)
-        legend_outside(figure, places[0])
+        drawing.legend_outside(figure, places[0])
     return figure

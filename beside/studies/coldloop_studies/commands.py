@@ -7,9 +7,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from coldloop.errors import NOT_FINITE, UsageError
+from coldloop import errors, service
 from coldloop.process.updating_periods import duration
-from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands.options import Command, check_load, configuration, positive_count
 
 if TYPE_CHECKING:
@@ -66,7 +65,7 @@ def _workers(options: argparse.Namespace) -> "Workers":
     from coldloop_studies.execution import Workers
 
     if options.scheduler and options.workers:
-        raise UsageError("--workers starts a local cluster, --scheduler uses a running one: give one of them")
+        raise errors.UsageError("--workers starts a local cluster, --scheduler uses a running one: give one of them")
     return Workers(options.workers or os.cpu_count() or 1, options.scheduler)
 
 
@@ -86,11 +85,13 @@ def _study_options(options: argparse.Namespace) -> "StudyOptions":
 def execute_study(options: argparse.Namespace) -> int:
     """A question that takes many runs, from the paper or beyond it."""
     if options.name is not None and options.name not in STUDIES:
-        raise UsageError(f"study {options.name}: unknown study; `coldloop study --list` lists them")
+        raise errors.UsageError(f"study {options.name}: unknown study; `coldloop study --list` lists them")
     if options.variants is not None and options.name != "compare":
-        raise UsageError("--variants: only `coldloop study compare` compares them")
+        raise errors.UsageError("--variants: only `coldloop study compare` compares them")
     if options.variants is None and options.name == "compare":
-        raise UsageError("study compare: name the file of the variants with --variants (`coldloop docs compare`)")
+        raise errors.UsageError(
+            "study compare: name the file of the variants with --variants (`coldloop docs compare`)"
+        )
     for name in options.load:
         check_load(name)
     from coldloop_studies import reproduction
@@ -110,10 +111,10 @@ def _do(study: "Study", options: argparse.Namespace) -> int:
     asked = _study_options(options)
     useless = [f"--{name}" for name in OF_RUNS if getattr(options, name)]
     if useless and not study.requests(asked):
-        raise UsageError(f"study {study.name} has no runs: {', '.join(useless)} would have no effect")
+        raise errors.UsageError(f"study {study.name} has no runs: {', '.join(useless)} would have no effect")
     if options.merge:
         if options.workers or options.scheduler:
-            raise UsageError("--merge does no runs: leave out --workers and --scheduler")
+            raise errors.UsageError("--merge does no runs: leave out --workers and --scheduler")
         merge(study, asked, options.merge, options.out)
     if options.shard:
         shard = Shard.parse(options.shard)
@@ -134,7 +135,7 @@ def _ending(failed_runs: int) -> int:
     sys.stderr.write(
         f"coldloop: in {failed_runs} runs updates have no answer: what the optimiser computed is not finite\n"
     )
-    return NOT_FINITE
+    return errors.NOT_FINITE
 
 
 def execute_reproduce(options: argparse.Namespace) -> int:
@@ -147,7 +148,7 @@ def execute_reproduce(options: argparse.Namespace) -> int:
 
 
 def _declare_design(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
+    service.add_configuration_options(parser)
     parser.add_argument("--load", type="name", dest="loads", nargs="+", metavar="LOAD", default=["a"],
                         help="loads to compare them under: names or CSV files (default: a)")  # fmt: skip
     parser.add_argument("--figure", type="write", metavar="FILE",
@@ -169,7 +170,7 @@ def execute_design(options: argparse.Namespace) -> int:
     for path in filter(None, (options.figure, options.out)):
         require_regular_file(path)
     if options.figure and options.figure.suffix.removeprefix(".") not in FIGURE_FORMATS:
-        raise UsageError(f"--figure {options.figure}: name a .png, .pdf or .svg file")
+        raise errors.UsageError(f"--figure {options.figure}: name a .png, .pdf or .svg file")
     settings = configuration(options).settings
     with make_console().status("") as status:
         found = instants.judged(

@@ -14,8 +14,7 @@ from coldloop.process.cold_box import TICK_S
 from coldloop_rig.plc_sizing.intervals import Interval, interval_of_mean, mean_ratio
 from coldloop_rig.results.recording import Indicators
 from coldloop_rig.text_tables import markdown_table
-from coldloop_studies import study
-from coldloop_studies.drawing import cost_bars, ratio_rows
+from coldloop_studies import drawing, study
 from coldloop_studies.request import Procedure, RunRequest, Series
 from coldloop_studies.study import NOISE, PROGRAM, TUNED, Load, Outcomes, Study, StudyOptions, StudyResult, loads
 from coldloop_studies.updating_period import ADAPTIVE, INTERRUPT, RULE, Policy
@@ -39,7 +38,7 @@ def _classical(found: study.Found[str]) -> StudyResult:
         result.rows += [(load.name, label, *row) for label, row in zip(CASES, rows, strict=True)]
         table.append((load.name, *(f"{cost:,.0f} ({L1:.1f} / {T5:.1f})" for cost, L1, T5 in rows)))
         result.note("J_BF of the classical loops over MPC at 2.5 s", rows[0][0] / rows[1][0])
-    result.figures["closed-loop cost"] = cost_bars(result, CASES, 0.25, logarithmic=True)
+    result.figures["closed-loop cost"] = drawing.cost_bars(result, CASES, 0.25, logarithmic=True)
     caption = "**J_BF (time outside the bands, %: L1 / T5)**"
     result.remarks.append(markdown_table(("hour", *CASES), table, caption))
     return result
@@ -96,7 +95,9 @@ def _contest(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
             )
             result.remarks.append(markdown_table(("way", *SOLVERS), rows, caption))
             drawn = {solver: {way.label: means[solver, way.label] for way in WAYS} for solver in SOLVERS}
-            result.figures[f"{title}, {cost}"] = ratio_rows(drawn, f"{cost} {over} (1)", 4.0, 0.16, len(SOLVERS))
+            result.figures[f"{title}, {cost}"] = drawing.ratio_rows(
+                drawn, f"{cost} {over} (1)", 4.0, 0.16, len(SOLVERS)
+            )
             for key, mean in means.items():
                 result.values[f"{cost} over ODE, Algorithm 1, {title}: {', '.join(key)}"] = [mean.value]
     return result
@@ -319,7 +320,7 @@ def _robustness(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
         for controller in CONTROLLERS
     }
     what = f"J_BF over that of the same controller on the plant {NOMINAL} (1)"
-    result.figures["controllers on plants that are off"] = ratio_rows(over, what, 8.0, 0.27, 3)
+    result.figures["controllers on plants that are off"] = drawing.ratio_rows(over, what, 8.0, 0.27, 3)
     result.remarks += controllers_remarks(options, found)
     for indicator, cost in (("J_BF", "J_BF"), ("J_open_mean", "open loop")):
         costs = {key: np.array([getattr(run, indicator) for run in some]) for key, some in runs.items()}
@@ -328,7 +329,7 @@ def _robustness(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
             for policy in POLICIES
         }
         what = f"{cost} over that of {USUAL} (1)"
-        result.figures[f"policies under {cost}"] = ratio_rows(ratios, what, 6.5, 0.13, 3)
+        result.figures[f"policies under {cost}"] = drawing.ratio_rows(ratios, what, 6.5, 0.13, 3)
         result.remarks.append(_policy_table(ratios, cost, costs))
     return result
 

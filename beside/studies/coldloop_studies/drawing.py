@@ -23,8 +23,7 @@ from coldloop.registers.plant import StationMode
 from coldloop.text import ends_text
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK, STYLE, draw_tau_u, label_marks, limit, styled
 from coldloop_rig.plc_sizing.intervals import Interval
-from coldloop_studies.request import Outcome
-from coldloop_studies.study import StudyResult
+from coldloop_studies import request, study
 
 COLUMN_IN: Final = 88 / 25.4
 """Width of a column of a journal, for figures without panels side by side."""
@@ -94,7 +93,7 @@ PANELS: Final = (
 )  # fmt: skip
 
 
-def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[float, float]]) -> Figure:
+def time_panels(outcomes: Sequence[tuple[str, request.Outcome]], bands: Sequence[tuple[float, float]]) -> Figure:
     """Draw load, cost, constrained outputs, inputs, iterations and updating period of runs under one load.
 
     The updating period is left out where all runs have the same fixed one.
@@ -126,7 +125,7 @@ def time_panels(outcomes: Sequence[tuple[str, Outcome]], bands: Sequence[tuple[f
     return figure
 
 
-def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: str) -> None:
+def _updates(place: Mapping[str, Axes], label: str, outcome: request.Outcome, colour: str) -> None:
     """Draw what changes at updating instants, as long as it was in force: for an updating period at most."""
     start = outcome.column("tick").astype(int)
     if not len(start):
@@ -142,7 +141,9 @@ def _updates(place: Mapping[str, Axes], label: str, outcome: Outcome, colour: st
         place["tau_u"].set_ylim(0, SAMPLING_PERIOD_S + 0.3)
 
 
-def over_time(title: str, runs: Sequence[tuple[str, Outcome]], shown: Mapping[str, str], height: float) -> Figure:
+def over_time(
+    title: str, runs: Sequence[tuple[str, request.Outcome]], shown: Mapping[str, str], height: float
+) -> Figure:
     """Draw series of a refrigerator's runs, `shown` with their labels, over each other; a cold box has not all."""
     with panels(len(shown), 1, height, sharex=True) as (figure, axes):
         for (label, run), colour in zip(runs, COLOURS, strict=False):
@@ -160,7 +161,7 @@ def over_time(title: str, runs: Sequence[tuple[str, Outcome]], shown: Mapping[st
     return figure
 
 
-def cost_bars(result: StudyResult, cases: Iterable[str], width: float, *, logarithmic: bool = False) -> Figure:
+def cost_bars(result: study.StudyResult, cases: Iterable[str], width: float, *, logarithmic: bool = False) -> Figure:
     """Draw J_BF of rows (load, case, J_BF, ...): a bar for each case, side by side for each load."""
     names = list(dict.fromkeys(str(row[0]) for row in result.rows))
     cases = list(cases)

@@ -35,11 +35,9 @@ from coldloop.errors import ColdloopError, ResultsError, StudyError, UsageError
 from coldloop.text import parsed_json, whole_text
 from coldloop_optimizer_plc.computing_settings import BudgetSettings, PlcBudget
 from coldloop_optimizer_plc.solvers import make_solver
+from coldloop_rig import interruption, progress, text_tables
 from coldloop_rig.figures.plot import save_figure
-from coldloop_rig.interruption import INTERRUPTION
-from coldloop_rig.progress import make_console
 from coldloop_rig.results.run_folder import installed_version, prepare_folder, write_json, writing
-from coldloop_rig.text_tables import markdown_table
 from coldloop_studies import request as requested
 from coldloop_studies.request import Outcome, Procedure, RunRequest, decisive_digest, programs_digest
 from coldloop_studies.settings import outside_digests, settings_of
@@ -221,12 +219,12 @@ def perform_all(requests: Sequence[RunRequest], store: Store, workers: Workers, 
     first = agenda.next()
     bar = Progress(
         TextColumn("{task.description}"), BarColumn(bar_width=32), MofNCompleteColumn(), TextColumn("runs"),
-        TimeElapsedColumn(), TimeRemainingColumn(), console=make_console(), refresh_per_second=2,
+        TimeElapsedColumn(), TimeRemainingColumn(), console=progress.make_console(), refresh_per_second=2,
     )  # fmt: skip
     if first:  # a signal unwinds here, so that the workers of a local cluster end: this thread only waits for them
         with (
             workers.connected() as client,
-            INTERRUPTION.passed_to(lambda by: default_int_handler(by, None)),
+            interruption.INTERRUPTION.passed_to(lambda by: default_int_handler(by, None)),
             bar,
         ):
             task = bar.add_task(title, total=len(outcomes), completed=len(agenda.done))
@@ -375,7 +373,7 @@ def section(result: StudyResult, folder: str = "") -> str:
     parts = [f"![{name}]({folder}{figure_file(name)})" for name in result.figures]
     parts += result.remarks
     if result.rows and (result.always_shown or len(result.rows) <= 24):
-        parts.append(markdown_table(result.columns, result.rows))
+        parts.append(text_tables.markdown_table(result.columns, result.rows))
     return "\n\n".join(parts) + "\n"
 
 

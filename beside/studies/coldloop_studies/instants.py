@@ -15,9 +15,7 @@ from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_rig.cosim.one_process import run_ideal_loop
 from coldloop_rig.figures.plot import COLOURS, DASHES, INK
-from coldloop_rig.plc_sizing.budget import counted_sizes, estimator_memory, footprint, problem_of
-from coldloop_rig.plc_sizing.intervals import ADAPTIVE, geometric_mean, loop_cost, require_costs
-from coldloop_rig.plc_sizing.operations import SOLVERS
+from coldloop_rig.plc_sizing import budget, intervals, operations
 from coldloop_rig.settings import Settings
 from coldloop_rig.text_tables import aligned
 from coldloop_studies.drawing import legend_outside, panels
@@ -81,13 +79,16 @@ def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], 
     for number, (label, design) in enumerate(sets.items()):
         done(number, len(sets))
         tried = settings.with_program(design=design)
-        program, (problem, prediction) = tried.optimizer_plc.program, problem_of(tried)
-        flops = SOLVERS[program.solver].operations(counted_sizes(problem)[1]).flops
+        program, (problem, prediction) = tried.optimizer_plc.program, budget.problem_of(tried)
+        flops = operations.SOLVERS[program.solver].operations(budget.counted_sizes(problem)[1]).flops
         plc = PlcBudget(program.budget, program.iteration_s * flops / (found[0].flops if found else flops))
-        costs = tuple(loop_cost(tried, name, ADAPTIVE, partial(run_ideal_loop, tried, ticks=ticks)) for name in names)
-        require_costs(costs)
+        costs = tuple(
+            intervals.loop_cost(tried, name, intervals.ADAPTIVE, partial(run_ideal_loop, tried, ticks=ticks))
+            for name in names
+        )
+        intervals.require_costs(costs)
         condition = float(np.linalg.cond(problem.Phi.astype(float)))
-        memory = footprint(problem, estimator_memory(prediction, program.estimator), program.solver).total
+        memory = budget.footprint(problem, budget.estimator_memory(prediction, program.estimator), program.solver).total
         iterations = plc.iterations(ticks) if plc.is_enough(ticks) else 0
         rows = len(problem.Gamma)
         found.append(Judged(label, design, problem.size, rows, condition, flops, memory, iterations, costs))
@@ -96,7 +97,7 @@ def judged(settings: Settings, names: Sequence[str], done: Callable[[int, int], 
 
 def losses(found: Sequence[Judged]) -> list[float]:
     """Return J_BF of each set over that of the fullest: the geometric mean over the loads."""
-    return [geometric_mean(np.array(one.costs) / np.array(found[-1].costs)) for one in found]
+    return [intervals.geometric_mean(np.array(one.costs) / np.array(found[-1].costs)) for one in found]
 
 
 def proposed(found: Sequence[Judged]) -> Judged:

@@ -9,15 +9,13 @@ from pathlib import Path
 from typing import Final
 
 from coldloop.process.cold_box import COLD_BOX, TICK_S
-from coldloop.registers.common import EventKind
-from coldloop.registers.control_plc import Mode
+from coldloop.registers import common, control_plc
 from coldloop.registers.plant import StationAlarm, StationMode
 from coldloop.service.journal import alarm_word
 from coldloop_rig.results.recording import CONTROL
 from coldloop_rig.text_tables import Cell
-from coldloop_studies.drawing import cost_bars, over_time
+from coldloop_studies import drawing, study
 from coldloop_studies.request import Outcome, RunRequest
-from coldloop_studies.study import TUNED, Found, Load, Outcomes, Study, StudyOptions, StudyResult, loads, study_of_loads
 
 REFRIGERATOR: Final = "plant.kind=refrigerator"
 PLANTS: Final = {
@@ -34,8 +32,8 @@ COUPLING_COLUMNS: Final = (
 COUPLING_SHOWN: Final = {"load": "load (W)", "P12": "HP (bar)", "P11": "LP (bar)", "T9": "T9 (K)", "T5": "T5 (K)"}
 
 
-def _coupling(found: Found[str]) -> StudyResult:
-    result = StudyResult(COUPLING_COLUMNS, [], {}, always_shown=True)
+def _coupling(found: study.Found[str]) -> study.StudyResult:
+    result = study.StudyResult(COUPLING_COLUMNS, [], {}, always_shown=True)
     for load, runs in found:
         alone, *_ = runs.values()
         for plant, run in runs.items():
@@ -45,8 +43,8 @@ def _coupling(found: Found[str]) -> StudyResult:
                 result.note(f"J_BF on the {plant}, over the cold box alone", i.J_BF / alone.indicators.J_BF)
         if "pressures" not in result.figures:
             title = f"hour {Path(load.name).name}"
-            result.figures["pressures"] = over_time(title, list(runs.items()), COUPLING_SHOWN, 6.0)
-    result.figures["closed-loop cost"] = cost_bars(result, PLANTS, 0.19)
+            result.figures["pressures"] = drawing.over_time(title, list(runs.items()), COUPLING_SHOWN, 6.0)
+    result.figures["closed-loop cost"] = drawing.cost_bars(result, PLANTS, 0.19)
     return result
 
 
@@ -63,10 +61,10 @@ def _range(run: Outcome, name: str, digits: int) -> str:
     return f"{series.min():.{digits}f}..{series.max():.{digits}f}"
 
 
-COUPLING: Final = study_of_loads(
+COUPLING: Final = study.study_of_loads(
     "coupling",
     "Beyond the paper: the whole refrigerator under MPC",
-    lambda options: loads(options, *"abcdef"),
+    lambda options: study.loads(options, *"abcdef"),
     lambda load: {plant: load.request(0.0, *own, trace_ticks=TRACE_TICKS) for plant, own in PLANTS.items()},
     _coupling,
 )
@@ -102,7 +100,7 @@ CASES: Final[dict[str, Case]] = {
     "the heater fully on for 10 min": ("a", _events((600, "heater", 2), (1200, "heater", 1))),
     "NEF34 blocks up, 20 % in an hour": ("a", _events((600, "blocked_nef34", 0.2))),
 }
-DRIVERS: Final = {"MPC": (TUNED,), "classical loops": ("control_plc.driver=classical",)}
+DRIVERS: Final = {"MPC": (study.TUNED,), "classical loops": ("control_plc.driver=classical",)}
 STATION: Final = {"LQ": (), "PI": ("plant.station.control=pi",)}
 COLUMNS: Final = (
     "event", "cold box", "station", "J_BF", "L1 outside (%)", "T5 outside (%)", "L1 (%)", "T5 (K)", "HP (bar)",
@@ -114,19 +112,19 @@ SHOWN: Final = {
 }  # fmt: skip
 
 
-def _disturbances(options: StudyOptions, outcomes: Outcomes) -> StudyResult:
-    result = StudyResult(COLUMNS, [], {}, always_shown=True)
+def _disturbances(options: study.StudyOptions, outcomes: study.Outcomes) -> study.StudyResult:
+    result = study.StudyResult(COLUMNS, [], {}, always_shown=True)
     for name, event in CASES.items():
         for load in _loads(event, options):
             runs = {pair: outcomes[request] for pair, request in _runs(event, load).items()}
             result.rows += [(f"{name} ({load.name})", *pair, *_measures(run)) for pair, run in runs.items()]
             if load.draw == 1:
                 labelled = [(", ".join(pair), run) for pair, run in runs.items()]
-                result.figures[name] = over_time("", labelled, SHOWN, 8.0)
+                result.figures[name] = drawing.over_time("", labelled, SHOWN, 8.0)
     return result
 
 
-DISTURBANCES: Final = Study(
+DISTURBANCES: Final = study.Study(
     "disturbances",
     "Beyond the paper: what happens to a refrigerator",
     lambda options: [
@@ -137,11 +135,11 @@ DISTURBANCES: Final = Study(
 """Events of a refrigerator, with LQ and PI at the station, MPC and loops at the cold box."""
 
 
-def _loads(event: Case, options: StudyOptions) -> list[Load]:
-    return loads(replace(options, loads=options.loads[:1]), event[0])
+def _loads(event: Case, options: study.StudyOptions) -> list[study.Load]:
+    return study.loads(replace(options, loads=options.loads[:1]), event[0])
 
 
-def _runs(event: Case, load: Load) -> dict[tuple[str, str], RunRequest]:
+def _runs(event: Case, load: study.Load) -> dict[tuple[str, str], RunRequest]:
     return {
         (driver, station): load.request(0.0, REFRIGERATOR, *event[1], *driving, *control, trace_ticks=TRACE_TICKS)
         for driver, driving in DRIVERS.items() for station, control in STATION.items()
@@ -157,8 +155,12 @@ def _measures(run: Outcome) -> tuple[str | float, ...]:
     }
     lost = round(float(run.series("lost")[-1]), 3)
     events = [event for event in run.events if event.service == CONTROL]
-    ladder = [f"{Mode.word_of(one.subject)} {one.tick * TICK_S:.0f} s" for one in events if one.kind == EventKind.MODE]
-    alarms = [alarm_word(one.subject, COLD_BOX) for one in events if one.kind == EventKind.ALARM_RAISED]
+    ladder = [
+        f"{control_plc.Mode.word_of(one.subject)} {one.tick * TICK_S:.0f} s"
+        for one in events
+        if one.kind == common.EventKind.MODE
+    ]
+    alarms = [alarm_word(one.subject, COLD_BOX) for one in events if one.kind == common.EventKind.ALARM_RAISED]
     return (
         i.J_BF, *i.outside_band_pct.values(), *spans, lost, ", ".join(modes),
         ", ".join(sorted(raised)) or "none", ", ".join(ladder), ", ".join(dict.fromkeys(alarms)) or "none",

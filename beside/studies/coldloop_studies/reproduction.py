@@ -19,9 +19,8 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, model_validator
 
 from coldloop import __version__
 from coldloop.text import parsed_toml, whole_text
+from coldloop_rig.plc_sizing import operations, plc
 from coldloop_rig.plc_sizing.intervals import Interval, geometric_mean, interval_of_mean
-from coldloop_rig.plc_sizing.operations import dense_cholesky
-from coldloop_rig.plc_sizing.plc import cholesky_times
 from coldloop_rig.results.run_folder import write_json, writing
 from coldloop_rig.text_tables import markdown_table
 from coldloop_studies.any_process import COMPARE, PERIODS
@@ -197,8 +196,8 @@ def paper_values() -> Mapping[str, float]:
     values["limited: J_BF"] = float(closed["qpoases"][one] / closed["qpoases"][-1])
     values["trajectories: J_BF"] = float(closed["ode"][one] / closed["qpoases"][-1])
     values["trajectories: J_BF of qpOASES over ODE"] = float(closed["qpoases"][one] / closed["ode"][one])
-    size, plc_s, laptop_s = cholesky_times()
-    speed = np.array([dense_cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
+    size, plc_s, laptop_s = plc.cholesky_times()
+    speed = np.array([operations.dense_cholesky(n).flops for n in size.tolist()]) / plc_s / 1e6
     values[SPEED] = float(speed[size >= 50].mean())
     values[SLOW_DOWN] = float((plc_s / laptop_s)[size >= 40].mean())
     hours = list(published_periods().values())

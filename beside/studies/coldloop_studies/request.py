@@ -19,19 +19,14 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError, UsageError
 from coldloop.kernels.reach import digest
-from coldloop.process.cold_box import COLD_BOX, L1, STATION_SIGNAL_NAMES, T5, TICK_S
-from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import load as load_model
+from coldloop.process import cold_box, load_profile, lti_model
 from coldloop.service.start import main as start_service
 from coldloop.text import file_digest, parsed_json
 from coldloop_optimizer_plc.solvers import make_solver
-from coldloop_plant.kinds import GROUP, NO_MISMATCH, noise_of
-from coldloop_plant.own_plants import LinearPlant
+from coldloop_plant import kinds, own_plants
 from coldloop_plant.settings import PlantKind
-from coldloop_rig.cosim.networked_run import run_on_localhost
-from coldloop_rig.cosim.one_process import OneProcessRig
+from coldloop_rig.cosim import networked_run, one_process, wiring
 from coldloop_rig.cosim.scenario import Scenario
-from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.results.recording import Indicators, Recorder, Recording, StageCost, evaluate, has_no_answer
 from coldloop_rig.results.run_folder import installed_version
 from coldloop_rig.settings import Settings
@@ -42,7 +37,7 @@ Series = NDArray[np.float64]
 
 PACKAGES_WITH_DATA = ("coldloop", "coldloop_plant", "coldloop_control_plc", "coldloop_optimizer_plc")
 DATA_SUFFIXES = (".json", ".npz", ".csv")
-T9 = [one.name for one in COLD_BOX.outputs].index("T9")
+T9 = [one.name for one in cold_box.COLD_BOX.outputs].index("T9")
 DECISIVE = {"limits", "model", "session", "plant", "control_plc", "optimizer_plc"}
 """Sections of the configuration that a run reads."""
 LIBRARIES = ("casadi", "clarabel", "daqp", "numba", "numpy", "osqp", "piqp", "qpalm")
@@ -64,7 +59,7 @@ class Procedure(StrEnum):
     """The optimiser and the control PLC with the linear model for a plant (`LinearRig`)."""
 
 
-class LinearRig(OneProcessRig):
+class LinearRig(one_process.OneProcessRig):
     """Control PLC and optimiser PLC with a linear plant; its loop is not compiled.
 
     Raises:
@@ -72,13 +67,15 @@ class LinearRig(OneProcessRig):
     """
 
     def __init__(self, settings: Settings) -> None:
-        if settings.plant.kind is not PlantKind.COLD_BOX or settings.plant.mismatch != NO_MISMATCH:
+        if settings.plant.kind is not PlantKind.COLD_BOX or settings.plant.mismatch != kinds.NO_MISMATCH:
             raise ConfigurationError("plant: the linear plant is a cold box without mismatch")
         super().__init__(settings, compiled=False)
 
-    def _plant(self, load: LoadProfile, seed: int) -> LinearPlant:
-        return LinearPlant(
-            load_model(self._settings.model.file), load=load, noise=noise_of(self._settings.plant.sensors, seed)
+    def _plant(self, load: load_profile.LoadProfile, seed: int) -> own_plants.LinearPlant:
+        return own_plants.LinearPlant(
+            lti_model.load(self._settings.model.file),
+            load=load,
+            noise=kinds.noise_of(self._settings.plant.sensors, seed),
         )
 
 
@@ -191,13 +188,13 @@ def _file_digest(path: Path) -> str:
 
 def programs() -> tuple[Any, ...]:
     """Return what does a run: `perform`, the services that it may start and the further plants, known by name."""
-    services = (import_module(f"coldloop_{service}.runtime").serve for service in SERVICES)
+    services = (import_module(f"coldloop_{service}.runtime").serve for service in wiring.SERVICES)
     return (perform, start_service, *services, *(point.load() for point in kinds_of_plants()))
 
 
 def kinds_of_plants() -> list[EntryPoint]:
     """Return the entry points of plants that packages bring, in the order of their names."""
-    return sorted(entry_points(group=GROUP), key=lambda point: point.name)
+    return sorted(entry_points(group=kinds.GROUP), key=lambda point: point.name)
 
 
 @lru_cache(maxsize=1)
@@ -230,7 +227,7 @@ def perform(request: RunRequest) -> str:
     """Do a run; return its outcome as JSON."""
     settings = settings_of(request.assignments)
     scenario = Scenario(
-        request.ticks, LoadProfile(request.times, request.watts), request.updating_period_s, request.draw
+        request.ticks, load_profile.LoadProfile(request.times, request.watts), request.updating_period_s, request.draw
     )
     recorder = Recorder(request.ticks)
     match request.procedure:
@@ -244,22 +241,22 @@ def perform(request: RunRequest) -> str:
             LinearRig(settings).run(scenario, recorder)
         case Procedure.CONFIGURED if request.networked:
             with tempfile.TemporaryDirectory(prefix="coldloop-logs-") as logs:
-                asyncio.run(run_on_localhost(settings, scenario, recorder, Path(logs)))
+                asyncio.run(networked_run.run_on_localhost(settings, scenario, recorder, Path(logs)))
         case Procedure.CONFIGURED:
             _rig(request.assignments).run(scenario, recorder)
     return _outcome(recorder.recording(), settings, request.trace_ticks).to_json()
 
 
-_rig = lru_cache(maxsize=1)(lambda assignments: OneProcessRig(settings_of(assignments)))
+_rig = lru_cache(maxsize=1)(lambda assignments: one_process.OneProcessRig(settings_of(assignments)))
 
 
 def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outcome:
-    model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+    model, design = lti_model.load(settings.model.file), settings.optimizer_plc.program.design
     trace_sha256 = recording.trace_sha256
     sensors, gauge = settings.plant.sensors, settings.plant.mismatch.level_gauge
     if any(sensors.biases) or gauge != 1.0:  # costs are those of what was reached, not of what was shown
         true_y = recording.y - np.array(sensors.biases, dtype=np.float32)
-        true_y[:, L1] /= gauge
+        true_y[:, cold_box.L1] /= gauge
         recording = recording._replace(y=true_y)
     return Outcome(
         programs=programs_digest(),
@@ -277,10 +274,10 @@ def _outcome(recording: Recording, settings: Settings, trace_ticks: int) -> Outc
 
 def _trace(recording: Recording, cost: Series, every: int) -> dict[str, list[float]]:
     kept: dict[str, Any] = {
-        "time_s": np.arange(len(recording.load)) * TICK_S,
+        "time_s": np.arange(len(recording.load)) * cold_box.TICK_S,
         "load": recording.load,
-        "L1": recording.y[:, L1],
-        "T5": recording.y[:, T5],
+        "L1": recording.y[:, cold_box.L1],
+        "T5": recording.y[:, cold_box.T5],
         "T9": recording.y[:, T9],
         "CV155": recording.u[:, 0],
         "NCR22_A": recording.u[:, 1],
@@ -288,5 +285,5 @@ def _trace(recording: Recording, cost: Series, every: int) -> dict[str, list[flo
         "cost": cost,
     }
     if recording.station.size:
-        kept |= dict(zip((*STATION_SIGNAL_NAMES, "mode", "alarms"), recording.station.T, strict=True))
+        kept |= dict(zip((*cold_box.STATION_SIGNAL_NAMES, "mode", "alarms"), recording.station.T, strict=True))
     return {name: [float(value) for value in column[::every]] for name, column in kept.items()}

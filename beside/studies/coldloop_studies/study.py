@@ -7,12 +7,8 @@ from typing import Any, Final, NamedTuple, TypeVar
 
 from matplotlib.figure import Figure
 
-from coldloop.config import MOST_BYTES, as_toml, flattened, load_configuration
-from coldloop.errors import ConfigurationError, UsageError
-from coldloop.process.declaration import Process
-from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import load as load_model
-from coldloop.text import parsed_toml, read_text
+from coldloop import config, errors, text
+from coldloop.process import declaration, load_profile, lti_model
 from coldloop_plant.load import find_load, named_families
 from coldloop_rig.cosim.scenario import natural_ticks
 from coldloop_rig.settings import Settings
@@ -65,7 +61,7 @@ class StudyOptions:
     """Settings of all runs, as `section.key=value`: `model.file` of another process than the cold box."""
 
     @property
-    def process(self) -> Process:
+    def process(self) -> declaration.Process:
         """The process of all runs."""
         return settings_of(self.settings).process
 
@@ -90,7 +86,7 @@ class Load:
 
     name: str
     draw: int
-    profile: LoadProfile
+    profile: load_profile.LoadProfile
     ticks: int
     settings: tuple[str, ...] = ()
     """Settings of its runs: those of the study, and noise."""
@@ -111,7 +107,7 @@ def draw_of(name: str, draw: int, options: StudyOptions) -> Load:
     named = named_families(name) is not None
     drawn = f"{name}@{draw}" if named and draw > 1 else name
     settings = settings_of(options.settings)
-    profile = find_load(drawn, load_model(settings.model.file).w0, settings.process)
+    profile = find_load(drawn, lti_model.load(settings.model.file).w0, settings.process)
     ticks = options.ticks or natural_ticks(drawn, profile)
     ticks = min(ticks, 2400) if options.quick else ticks  # ten minutes
     noise = NOISE if not named and len(options.draws) > 1 else ()
@@ -239,39 +235,41 @@ def read_variants(file: Path, own: tuple[str, ...] = ()) -> tuple[Variant, ...]:
     """
     remedy = "name a TOML file with a table for each variant (`coldloop docs compare`)"
     try:
-        content = parsed_toml(read_text(file, remedy, UsageError, MOST_BYTES))
+        content = text.parsed_toml(text.read_text(file, remedy, errors.UsageError, config.MOST_BYTES))
     except ValueError as error:
-        raise UsageError(f"{file}: not TOML: {error}; {remedy}") from None
+        raise errors.UsageError(f"{file}: not TOML: {error}; {remedy}") from None
     variants = tuple(_variant(file, name, table, own) for name, table in content.items())
     if len(variants) < 2:
-        raise UsageError(f"{file}: {len(variants)} variant{'s' if not variants else ''}; write the table of the "
+        raise errors.UsageError(f"{file}: {len(variants)} variant{'s' if not variants else ''}; write the table of the "
                          "reference first, then one for each variant to compare")  # fmt: skip
     same = {variant.assignments: variant.name for variant in reversed(variants)}
     for variant in variants:
         if (first := same[variant.assignments]) != variant.name:
-            raise UsageError(f"{file} [{variant.name}]: has the settings of [{first}]; leave one of them out")
+            raise errors.UsageError(f"{file} [{variant.name}]: has the settings of [{first}]; leave one of them out")
     return variants
 
 
 def _variant(file: Path, name: str, table: Any, own: tuple[str, ...]) -> Variant:  # noqa: ANN401 written by a user
     place = f"{file} [{name}]"
     if not isinstance(table, Mapping):
-        raise UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")
+        raise errors.UsageError(f"{file}: {name} is not in the table of a variant; write [NAME] above it")
     if not 0 < len(name) <= LONGEST_NAME or not name.isprintable() or NOT_IN_NAMES & {*name} or max(name) > LAST_LETTER:
-        raise UsageError(
+        raise errors.UsageError(
             f"{file} [{name[:LONGEST_NAME]!a}]: name it with 1 to {LONGEST_NAME} printable Latin, Greek or Cyrillic "
             "characters other than $, | and \\"
         )
-    settings = {key: value for key, value in flattened(table).items() if value != {}}
+    settings = {key: value for key, value in config.flattened(table).items() if value != {}}
     for key in settings:
         for ineffective, instead in INEFFECTIVE.items():
             if f"{key}.".startswith(f"{ineffective}."):
-                raise UsageError(f"{place}: {key}: has no effect on this study: {instead}")
+                raise errors.UsageError(f"{place}: {key}: has no effect on this study: {instead}")
     options = {key: (value, place) for key, value in settings.items()}
     try:
-        effective = load_configuration(Settings, environment={}, assignments=(*PAPER, *own, TUNED), options=options)
+        effective = config.load_configuration(
+            Settings, environment={}, assignments=(*PAPER, *own, TUNED), options=options
+        )
         outside_digests(effective.settings.optimizer_plc.program.outside)
-    except ConfigurationError as error:
+    except errors.ConfigurationError as error:
         said = str(error).removeprefix(f"{place}: ")
-        raise ConfigurationError(f"{place}: {said}") from None
-    return Variant(name, (TUNED, *(f"{key}={as_toml(value)}" for key, value in sorted(settings.items()))))
+        raise errors.ConfigurationError(f"{place}: {said}") from None
+    return Variant(name, (TUNED, *(f"{key}={config.as_toml(value)}" for key, value in sorted(settings.items()))))

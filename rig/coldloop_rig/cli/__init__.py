@@ -15,9 +15,8 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import Any, Final, NoReturn
 
-from coldloop import __version__
+from coldloop import __version__, service
 from coldloop.errors import ColdloopError, UsageError, foreign, printable
-from coldloop.service import add_configuration_options
 from coldloop_rig.interruption import INTERRUPTION
 
 OPTION: Final = "--process"
@@ -65,7 +64,7 @@ def named_process(arguments: Sequence[str]) -> Iterator[list[str]]:
 def _configured(arguments: Sequence[str]) -> Path | None:
     """Return the model file of the configuration; what is wrong with the arguments the command itself says."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
-    add_configuration_options(parser)
+    service.add_configuration_options(parser)
     try:
         options, _ = parser.parse_known_args(arguments)
     except argparse.ArgumentError:

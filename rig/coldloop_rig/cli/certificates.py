@@ -18,10 +18,9 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from coldloop.errors import ResultsError, UsageError
+from coldloop import errors, text
 from coldloop.modbus.connection import ROLE_EXTENSION, encoded_role
 from coldloop.registers.declaration import Role
-from coldloop.text import read_bytes, replace_file, require_regular_file
 from coldloop_rig.cosim.wiring import SERVICES
 from coldloop_rig.results.run_folder import prepare_folder, writing
 
@@ -188,7 +187,7 @@ def write_site(out: Path, hosts: Sequence[str], days: int) -> tuple[int, Path]:
         lines += [f"{key} = {json.dumps(str(folder / name), ensure_ascii=False)}" for key, name in names.items()]
     files |= {REVOCATIONS: authority.revocation_list([], days), CONFIGURATION: ("\n".join(lines) + "\n").encode()}
     if present := next((name for name in files if (out / name).exists()), None):
-        raise UsageError(f"{out / present} exists: name another folder with --out, or remove the old files")
+        raise errors.UsageError(f"{out / present} exists: name another folder with --out, or remove the old files")
     prepare_folder(out)
     try:
         for name, data in files.items():
@@ -197,7 +196,7 @@ def write_site(out: Path, hosts: Sequence[str], days: int) -> tuple[int, Path]:
             with os.fdopen(descriptor, "wb") as stream:
                 stream.write(data)
     except OSError as error:
-        raise ResultsError(f"{error.filename or out}: {error.strerror}; choose another --out") from None
+        raise errors.ResultsError(f"{error.filename or out}: {error.strerror}; choose another --out") from None
     return len(pairs), out / CONFIGURATION
 
 
@@ -212,20 +211,20 @@ def revoke(out: Path, names: Sequence[str], days: int) -> tuple[int, Path]:
     certificate = _loaded(out / "ca.crt", MADE, x509.load_pem_x509_certificate)
     key = _loaded(out / "ca.key", needed, partial(load_pem_private_key, password=None))
     if not isinstance(key, ec.EllipticCurvePrivateKey):
-        raise UsageError(f"{out / 'ca.key'}: not a key that `coldloop certificates` has made")
+        raise errors.UsageError(f"{out / 'ca.key'}: not a key that `coldloop certificates` has made")
     authority = Authority(Pair(certificate, key))
     revoked = list(_loaded(out / REVOCATIONS, ours, x509.load_pem_x509_crl))
     present = {each.serial_number for each in revoked}
     certificates = [_loaded(out / f"{name}.crt", MADE, x509.load_pem_x509_certificate) for name in names]
     revoked += [revoked_now(each) for each in certificates if each.serial_number not in present]
     with writing(out / REVOCATIONS):
-        require_regular_file(out / REVOCATIONS)
-        replace_file(out / REVOCATIONS, authority.revocation_list(revoked, days))
+        text.require_regular_file(out / REVOCATIONS)
+        text.replace_file(out / REVOCATIONS, authority.revocation_list(revoked, days))
     return len(revoked), out / REVOCATIONS
 
 
 def _loaded(file: Path, remedy: str, load: Callable[[bytes], T]) -> T:
     try:
-        return load(read_bytes(file, remedy))
+        return load(text.read_bytes(file, remedy))
     except (ValueError, TypeError) as error:
-        raise UsageError(f"{file}: {error}; {remedy}") from None
+        raise errors.UsageError(f"{file}: {error}; {remedy}") from None

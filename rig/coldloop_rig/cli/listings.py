@@ -18,20 +18,17 @@ from typing import Any, Final, get_args
 import numpy as np
 from pydantic import BaseModel
 
-from coldloop.config import as_toml
-from coldloop.errors import ModelFileError, printable
+from coldloop import config, errors
 from coldloop.process.cold_box import L1, T5
 from coldloop.process.lti_model import COLD_BOX, LtiModel, load
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.settings import ControlDesign
-from coldloop_plant.cold_box import ColdBox
+from coldloop_plant.cold_box import ColdBox, plant_file
 from coldloop_plant.cold_box import model as cold_box
-from coldloop_plant.cold_box.plant_file import PlantFile
 from coldloop_plant.helium import load_helium
 from coldloop_plant.kinds import kind_named
 from coldloop_plant.settings import StationSettings
-from coldloop_rig.cli import command_groups, make_parser
-from coldloop_rig.text_tables import markdown_table
+from coldloop_rig import cli, text_tables
 
 Schema = Mapping[str, Any]
 """A JSON schema, or a part of one."""
@@ -95,7 +92,7 @@ def _tables(section: Schema, declared: Schema, place: str, told: dict[str, str])
         held = str(_declared(said, declared).get("description", "")).partition("\n\n")[0]
         meaning = " ".join(str(said.get("description") or held).split())
         rows.append((f"`{key}`", _value(said, declared), default, meaning))
-    yield f"{markdown_table(('key', 'value', 'if not given', 'meaning'), rows)}\n"
+    yield f"{text_tables.markdown_table(('key', 'value', 'if not given', 'meaning'), rows)}\n"
     for key, said in keys.items():
         within = _section(said, declared)
         if within is not None:
@@ -149,16 +146,16 @@ def _default(said: Schema, declared: Schema) -> str:
     default = said.get("default")
     if _one(said).get("format") == "path" and default:
         return f"`{Path(default).name}`, shipped"
-    return "" if _section(said, declared) or default in (None, "", [], {}) else f"`{as_toml(default)}`"
+    return "" if _section(said, declared) or default in (None, "", [], {}) else f"`{config.as_toml(default)}`"
 
 
 def command_listing() -> str:
     """Return a section for each group of commands, with a table of the options of each."""
     parts = []
-    for group, commands in command_groups().items():
+    for group, commands in cli.command_groups().items():
         parts.append(f"## {group[0].upper()}{group[1:]}\n")
         for name in commands:
-            parts += _of_command(_subparsers(make_parser(name))[name], f"coldloop {name}", "###")
+            parts += _of_command(_subparsers(cli.make_parser(name))[name], f"coldloop {name}", "###")
     return "\n".join(parts)
 
 
@@ -174,7 +171,7 @@ def _of_command(parser: argparse.ArgumentParser, name: str, level: str) -> Itera
         and not isinstance(each, argparse._SubParsersAction)  # noqa: SLF001
     ]  # fmt: skip
     if rows:
-        yield f"{markdown_table(('option', 'meaning'), rows)}\n"
+        yield f"{text_tables.markdown_table(('option', 'meaning'), rows)}\n"
     for sub, one in _subparsers(parser).items():
         yield from _of_command(one, f"{name} {sub}", f"{level}#")
 
@@ -211,7 +208,7 @@ HORIZON_S = 100.0
 
 
 def describe_model(
-    in_use: Path, plant: PlantFile, design: ControlDesign, control: StationSettings = DEFAULT_CONTROL
+    in_use: Path, plant: plant_file.PlantFile, design: ControlDesign, control: StationSettings = DEFAULT_CONTROL
 ) -> tuple[LtiModel, str, ColdBox]:
     """Solve for the operating point and linearise there; return the model and its description.
 
@@ -254,10 +251,10 @@ def describe_model(
           for i, (name, unit) in enumerate(signals)),
         *([kink] if error >= 1e-3 else []), *_band_lines(rest, design), f"model      sha256 {model.digest}",
     ]  # fmt: skip
-    with suppress(ModelFileError):  # the command then says what is wrong with it
+    with suppress(errors.ModelFileError):  # the command then says what is wrong with it
         configured = load(in_use)
         lines.append(f"in use     sha256 {configured.digest} ({in_use})")
-        lines += [f"           {printable(configured.note)}"] if configured.note else []
+        lines += [f"           {errors.printable(configured.note)}"] if configured.note else []
     return model, "\n".join(lines) + "\n", box
 
 

@@ -17,8 +17,7 @@ from typing import Any, Final, NamedTuple
 from coldloop.modbus.requests import MAX_READ_WORDS
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.process.declaration import Process
-from coldloop.registers.common import Alarm, alarms_of
-from coldloop.registers.control_plc import Operator
+from coldloop.registers import common, control_plc
 from coldloop.registers.declaration import Block, Kind, Register, RegisterMap
 from coldloop.service.journal import alarm_word
 from coldloop_rig.cli.commands.options import HostPort
@@ -217,11 +216,11 @@ def exported(register_map: RegisterMap) -> Iterator[Tag]:
     """Yield the tags of a service, in the order of their addresses; names that would be the same end with these."""
     process, tags = register_map.process, list[Tag]()
     for block in register_map.shown:
-        if block.writer is not None and block.record is not Operator:
+        if block.writer is not None and block.record is not control_plc.Operator:
             continue
         rows = {0: block.name} if block.rows == 1 else {}
-        if block.record is Alarm:
-            rows = {int(kind): f"{block.name}_{alarm_word(kind, process)}" for kind in alarms_of(process)}
+        if block.record is common.Alarm:
+            rows = {int(kind): f"{block.name}_{alarm_word(kind, process)}" for kind in common.alarms_of(process)}
         texts = {name for name, field in block.fields.items() if field.is_text}
         tags += [
             Tag(_NOT_IN_NAMES.sub("_", f"{prefix}_{register.name}"), block.name, register)

@@ -24,19 +24,9 @@ from coldloop.registers.common import ConfigurationDigest, ConfigurationLine, co
 from coldloop.service.start import COMPILING, SERVING, run_event_loop
 from coldloop.text import parsed_json
 from coldloop_rig import PYTHON
-from coldloop_rig.cosim import session
+from coldloop_rig.cosim import session, wiring
 from coldloop_rig.cosim.scenario import Job, Scenario, StopRequest, with_copied_load
 from coldloop_rig.cosim.session import SessionClient
-from coldloop_rig.cosim.wiring import (
-    SERVICES,
-    START_PATIENCE_S,
-    Links,
-    ReservedPorts,
-    RigEndpoints,
-    answered_in_time,
-    endpoints_on,
-    wired,
-)
 from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings
 
@@ -155,15 +145,18 @@ class LocalServices:
     """
 
     def __init__(
-        self, settings: Settings, log_folder: Path, *, links: Links | None = None, ports: Sequence[int] | None = None,
-        services: Sequence[str] = SERVICES, optimizer: Sequence[str] = (),
+        self, settings: Settings, log_folder: Path, *, links: wiring.Links | None = None,
+        ports: Sequence[int] | None = None,
+        services: Sequence[str] = wiring.SERVICES, optimizer: Sequence[str] = (),
     ) -> None:  # fmt: skip
-        self._ports = ReservedPorts(len(SERVICES) if ports is None else 0)
-        self.endpoints = endpoints_on(ports or self._ports.numbers, settings)
+        self._ports = wiring.ReservedPorts(len(wiring.SERVICES) if ports is None else 0)
+        self.endpoints = wiring.endpoints_on(ports or self._ports.numbers, settings)
         self._links = links
         if links is not None:
             links.put_before(self.endpoints)
-        self._environment = to_environment(wired(settings, self.endpoints, None if links is None else links.detours))
+        self._environment = to_environment(
+            wiring.wired(settings, self.endpoints, None if links is None else links.detours)
+        )
         self._commands: dict[str, tuple[str, ...]] = {
             service: (*PYTHON, "-m", f"coldloop_{service}") for service in services
         }
@@ -333,11 +326,9 @@ async def run_on_localhost(
     """
     async with LocalServices(settings, log_folder, optimizer=optimizer) as services:
         with contextlib.closing(SessionClient(services.endpoints, settings)) as rig:
-            await services.during(rig.connect(START_PATIENCE_S))
+            await services.during(rig.connect(wiring.START_PATIENCE_S))
             await services.during(rig.run(scenario, recorder))
 
-
-T = TypeVar("T")
 
 SHOWN: Final[Mapping[str, Sequence[str]]] = {
     "plant": coldloop_plant.settings.SHOWN,
@@ -447,8 +438,8 @@ def _read(
     found: list[T] = []
 
     async def read() -> int:
-        with closing(session.SessionClient(RigEndpoints(*endpoints), effective.settings)) as rig:
-            async with answered_in_time(f"to read what the rig {what}"):
+        with closing(session.SessionClient(wiring.RigEndpoints(*endpoints), effective.settings)) as rig:
+            async with wiring.answered_in_time(f"to read what the rig {what}"):
                 await rig.connect(ATTACH_PATIENCE_S)
                 found.append(await work(rig))
         return 0
@@ -490,11 +481,11 @@ async def _run(job: Job, recorder: Recorder, folder: Path) -> None:
     if not (recorded or job.way is Way.ATTACHED):
         settings = with_copied_load(settings, scenario.load, folder)
         return await run_on_localhost(settings, scenario, recorder, folder / "logs", job.optimizer)
-    with closing(session.SessionClient(RigEndpoints(*job.endpoints), settings, tolerant=recorded)) as rig:
+    with closing(session.SessionClient(wiring.RigEndpoints(*job.endpoints), settings, tolerant=recorded)) as rig:
         await rig.connect(ATTACH_PATIENCE_S)
         if recorded:
             return await session.record_session(rig, scenario, recorder)
-        async with answered_in_time("to read what the rig does"):
+        async with wiring.answered_in_time("to read what the rig does"):
             saved = await session.save_session(rig)
         try:
             await rig.run(scenario, recorder)

@@ -11,12 +11,8 @@ import numpy as np
 
 from coldloop.errors import LoadFileError
 from coldloop.kernels.cache import kernels_of
-from coldloop.process.declaration import Process
-from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import load as load_model
-from coldloop.registers import Maps, maps_of
-from coldloop.registers.codec import as_transmitted
-from coldloop.registers.control_plc import SequenceRow, Update, Verdict, control_map
+from coldloop.process import declaration, load_profile, lti_model
+from coldloop.registers import Maps, codec, control_plc, maps_of
 from coldloop.registers.plant import LoadStep, Measurement, PlantSample, plant_map
 from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.program import ControlProgram
@@ -56,40 +52,42 @@ class Programs(NamedTuple):
         if control.awaiting_sequence:
             answer = control.offer(optimizer.solve())
             optimizer.answered(late=False)
-            recorder.update(as_transmitted(optimizer.report(Verdict(answer.verdict)), self.maps.optimizer_plc))
+            recorder.update(
+                codec.as_transmitted(optimizer.report(control_plc.Verdict(answer.verdict)), self.maps.optimizer_plc)
+            )
         if not control.player.invited:
             control.optimizer_seen()  # an optimiser that idles goes on to send heartbeats
-        actuators = as_transmitted(control.begin_scan(), to_plant)
+        actuators = codec.as_transmitted(control.begin_scan(), to_plant)
         u = actuators.u
         plant.apply(u)
         measured = Measurement(plant.tick, plant.load, plant.measure(), plant.state, actuators.session, u)
-        measurement = as_transmitted(measured, to_plant)
+        measurement = codec.as_transmitted(measured, to_plant)
         if plant.station is not None:
-            recorder.station(as_transmitted(plant.station, to_plant))
+            recorder.station(codec.as_transmitted(plant.station, to_plant))
         recorder.sample(PlantSample(plant.tick, measurement.load, u, measurement.y, measurement.x))
         plant.advance()
         self.plan(control.end_scan(measurement))
 
-    def plan(self, update: Update | None) -> None:
+    def plan(self, update: control_plc.Update | None) -> None:
         """Let the optimiser plan an update, if one was latched."""
         if update is not None:
             to_control = self.maps.control_plc
-            plan = self.optimizer.plan(as_transmitted(update, to_control))
-            self.control.accept_plan(as_transmitted(plan, to_control))
+            plan = self.optimizer.plan(codec.as_transmitted(update, to_control))
+            self.control.accept_plan(codec.as_transmitted(plan, to_control))
 
 
-def load_table(load: LoadProfile, process: Process) -> LoadProfile:
+def load_table(load: load_profile.LoadProfile, process: declaration.Process) -> load_profile.LoadProfile:
     """Return a load of a process as the plant's table has it after crossing the bus.
 
     Raises:
         LoadFileError: The table does not take it.
     """
     registers = plant_map(process)
-    steps = [as_transmitted(LoadStep(*step), registers) for step in zip(load.times, load.watts, strict=True)]
+    steps = [codec.as_transmitted(LoadStep(*step), registers) for step in zip(load.times, load.watts, strict=True)]
     low, high = process.load.stored_span
     if not all(low <= step.watts <= high for step in steps):
         raise LoadFileError(f"a load is outside {low:g} to {high:g} {process.load.unit}")
-    return LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
+    return load_profile.LoadProfile(tuple(step.tick for step in steps), tuple(step.watts for step in steps))
 
 
 class OneProcessRig:
@@ -106,7 +104,7 @@ class OneProcessRig:
         self._header = own_header(settings.model.file)
         program = settings.optimizer_plc.program
         with self._kernels():
-            self.optimizer = OptimizerProgram(load_model(settings.model.file), program, settings.limits)
+            self.optimizer = OptimizerProgram(lti_model.load(settings.model.file), program, settings.limits)
         self.control = make_control_program(self._header, settings.control_plc, settings.limits)
 
     def run(self, scenario: Scenario, recorder: Recorder) -> None:
@@ -137,10 +135,10 @@ class OneProcessRig:
         plant = kind if kind is PlantKind.REFRIGERATOR else self._settings.process.name
         return kernels_of(f"the {plant.replace('-', ' ')} and the {solver} solver in one process", about_s=50)
 
-    def _plant(self, load: LoadProfile, seed: int) -> PlantProgram:
+    def _plant(self, load: load_profile.LoadProfile, seed: int) -> PlantProgram:
         return plant_maker(self._header, self._settings.plant)(load, seed)
 
-    def _stretches(self, plant: PlantProgram, load: LoadProfile, ticks: int) -> "CompiledStretches | None":
+    def _stretches(self, plant: PlantProgram, load: load_profile.LoadProfile, ticks: int) -> "CompiledStretches | None":
         """Return what runs ahead in compiled loops, where there are any."""
         if self._compiled is False:
             return None
@@ -172,7 +170,7 @@ def run_ideal_loop(
         ticks: From one instant to the next, 1 to 20.
         solved: Called with each problem.
     """
-    header, model = own_header(settings.model.file), load_model(settings.model.file)
+    header, model = own_header(settings.model.file), lti_model.load(settings.model.file)
     program = settings.optimizer_plc.program
     prediction = prediction_of(model, program.estimator.disturbed, program.design)
     problem = PredictiveProblem(prediction, program.design, settings.limits)
@@ -180,7 +178,9 @@ def run_ideal_loop(
     estimator, belief = estimator_of(prediction, kalman), no_belief(prediction.n_states, len(prediction.y0))
     solver = DaqpSolver(program.daqp)
     plant = plant_maker(header, settings.plant)(scenario.load, scenario.seed)
-    applied = as_transmitted(SequenceRow(tuple(model.u0.tolist())), control_map(settings.process)).u
+    applied = codec.as_transmitted(
+        control_plc.SequenceRow(tuple(model.u0.tolist())), control_plc.control_map(settings.process)
+    ).u
     guard = OutputGuard(settings.limits, applied)
     z = problem.hold(np.zeros(len(applied)))
     recorder.begin()

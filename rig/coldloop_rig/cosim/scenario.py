@@ -6,12 +6,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final
 
-from coldloop.config import Configuration
-from coldloop.errors import RunInterruptedError
+from coldloop import config, errors, table, text
 from coldloop.modbus.settings import Endpoint
 from coldloop.process.load_profile import LoadProfile
-from coldloop.table import TIME
-from coldloop.text import whole_text
 from coldloop_plant.load import HOUR_TICKS, named_families
 from coldloop_rig.results.recording import Recorder, Way
 from coldloop_rig.settings import Settings
@@ -49,7 +46,7 @@ def with_copied_load(settings: Settings, profile: LoadProfile, folder: Path) -> 
     (folder / INPUTS).mkdir(exist_ok=True)
     process, steps = settings.process, zip(profile.times, profile.watts, strict=True)
     rows = "".join(f"{tick * process.tick_s!r},{watts!r}\n" for tick, watts in steps)
-    whole_text(folder / LOAD_COPY, f"{TIME},{process.load.column}\n{rows}")
+    text.whole_text(folder / LOAD_COPY, f"{table.TIME},{process.load.column}\n{rows}")
     plant = settings.plant.model_copy(update={"load": str(folder / LOAD_COPY)})
     return settings.model_copy(update={"plant": plant})
 
@@ -62,7 +59,7 @@ Conduct = Callable[[Recorder, Path], Awaitable[None]]
 class Job:
     """A run to be done."""
 
-    effective: Configuration[Settings]
+    effective: config.Configuration[Settings]
     scenario: Scenario
     way: Way
     endpoints: tuple[Endpoint, ...] = ()
@@ -77,13 +74,13 @@ class StopRequest:
     """A signal on its way to the run."""
 
     def __init__(self) -> None:
-        self.error: RunInterruptedError | None = None
+        self.error: errors.RunInterruptedError | None = None
         self.recorder: Recorder | None = None
         self.cancel: Callable[[], object] | None = None
 
     def __call__(self, number: signal.Signals) -> None:
         """Take a signal (signal handler)."""
-        self.error = RunInterruptedError(number.name, number)
+        self.error = errors.RunInterruptedError(number.name, number)
         if self.recorder is not None:
             self.recorder.stop(self.error)
         if self.cancel is not None:

@@ -15,14 +15,10 @@ from typing import Final, NamedTuple, TypeVar
 
 from coldloop.errors import LinkError, ModelFileError, PeerUnreachableError, UsageError
 from coldloop.modbus.client import RegisterClient
-from coldloop.operating.execution import LoadStream, lead_ticks, write_pace, write_table
-from coldloop.operating.observer import BATCH, JournalReader, SampleReader, Subscriber, UpdateReader, last_update
+from coldloop.operating import execution, observer
 from coldloop.process.load_profile import LoadProfile
-from coldloop.registers import maps_of, plant
-from coldloop.registers.codec import sealed
+from coldloop.registers import codec, control_plc, maps_of, optimizer_plc, plant
 from coldloop.registers.common import Event, EventKind, Identity, JournalPage, SessionPace
-from coldloop.registers.control_plc import ControlSession, Grant, LadderStatus, Mode, Operator, OperatorMode, Status
-from coldloop.registers.optimizer_plc import Optimization, OptimizerSession
 from coldloop_plant.kinds import own_header
 from coldloop_rig.cosim.scenario import Scenario
 from coldloop_rig.cosim.wiring import QUIET_S, SERVICES, RigEndpoints
@@ -66,7 +62,7 @@ def next_session(present: Sequence[int]) -> int:
 class SessionEvents:
     """Passes what control PLC and plant note from now on to a recorder."""
 
-    def __init__(self, readers: Mapping[str, JournalReader], recorder: Subscriber) -> None:
+    def __init__(self, readers: Mapping[str, observer.JournalReader], recorder: observer.Subscriber) -> None:
         self._readers = readers
         self._recorder = recorder
         self._looked_at = 0.0
@@ -119,7 +115,7 @@ class SessionClient:
         self.clients = {service: every[service] for service in services}
         self.session = 0
         """The session that was started last; 0 is none."""
-        self.load: LoadStream | None = None
+        self.load: execution.LoadStream | None = None
         """The load of the session that was started last."""
         self.lost_contacts = 0
         """Requests that were not answered, with `tolerant`."""
@@ -171,9 +167,11 @@ class SessionClient:
                         f"{self.plant.peer} has been at tick {done} for {now - quiet_since:.0f} s: "
                         "see the logs of the control PLC and of the optimiser"
                     )
-                if lockstep and ticks > 2 * BATCH:  # the rig must not come to the end of its grant, ...
+                if lockstep and ticks > 2 * observer.BATCH:  # the rig must not come to the end of its grant, ...
                     pause_s /= 2
-                elif lockstep and ticks < BATCH:  # ... and each look asks all three services, so it is worth some ticks
+                elif (
+                    lockstep and ticks < observer.BATCH
+                ):  # ... and each look asks all three services, so it is worth some ticks
                     pause_s = min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S)
                 pause_s = max(pause_s, SHORTEST_PAUSE_S)
                 await asyncio.sleep(pause_s)
@@ -184,16 +182,18 @@ class SessionClient:
     async def begin(self, scenario: Scenario, recorder: Recorder) -> None:
         """Start a session for the scenario, recorded from now on."""
         readers = {
-            service: JournalReader(client, (await client.read(JournalPage)).newest + 1)
+            service: observer.JournalReader(client, (await client.read(JournalPage)).newest + 1)
             for service, client in ((CONTROL, self.control), (PLANT, self.plant))
         }
         self._events = SessionEvents(readers, recorder)
         session = await self.start(scenario)
         self._scenario, self._recorder = scenario, recorder
-        self._samples = SampleReader(
+        self._samples = observer.SampleReader(
             self.plant, recorder, session, scenario.ticks, realtime=scenario.realtime, tolerant=self._tolerant
         )
-        self._updates = UpdateReader(self.optimizer, recorder.update, session, first=0, tolerant=self._tolerant)
+        self._updates = observer.UpdateReader(
+            self.optimizer, recorder.update, session, first=0, tolerant=self._tolerant
+        )
         recorder.begin()
 
     async def start(self, scenario: Scenario) -> int:
@@ -207,11 +207,11 @@ class SessionClient:
         realtime = int(scenario.realtime)
         if "optimizer_plc" in self.clients:
             period = round(scenario.updating_period_s / self._tick_s)
-            await self.optimizer.write(OptimizerSession(session, realtime, scenario.factor, period))
-        rows = await write_table(self.plant, scenario.load)
+            await self.optimizer.write(optimizer_plc.OptimizerSession(session, realtime, scenario.factor, period))
+        rows = await execution.write_table(self.plant, scenario.load)
         await self.plant.write(plant.PlantSession(session, realtime, scenario.factor, scenario.seed, rows))
-        self.load = LoadStream(self.plant, session, scenario.load, sent=rows)
-        await self.control.write(ControlSession(session, realtime, scenario.factor))
+        self.load = execution.LoadStream(self.plant, session, scenario.load, sent=rows)
+        await self.control.write(control_plc.ControlSession(session, realtime, scenario.factor))
         return session
 
     async def hold(self, look_s: float, failed: Callable[[LinkError], object]) -> None:
@@ -235,7 +235,7 @@ class SessionClient:
                 failed(error)
             await asyncio.sleep(look_s)
 
-    async def _supply(self, load: LoadStream, tick: int) -> None:
+    async def _supply(self, load: execution.LoadStream, tick: int) -> None:
         is_over = False
         try:
             is_over = await load.was_replaced()
@@ -256,12 +256,12 @@ class SessionClient:
         """
         if self._background is not None:
             await self._background
-        status = await self.contact(self.control.read(Status))
-        if status is not None and status.mode != Mode.CLASSICAL:  # the loops ask for no updates
+        status = await self.contact(self.control.read(control_plc.Status))
+        if status is not None and status.mode != control_plc.Mode.CLASSICAL:  # the loops ask for no updates
             last = 0 if self._scenario.realtime else status.update
             updates = self._updates.read_until(self._scenario.ticks, last, QUIET_S)
             await self.contact(updates, within_s=2.0 * QUIET_S)  # it gives up by itself, and says why
-            status = await self.contact(self.control.read(Status))
+            status = await self.contact(self.control.read(control_plc.Status))
         if status is not None:
             self._recorder.link = LinkStatistics(
                 status.deadline_misses, status.overruns, status.lateness_max, status.lateness_p99
@@ -286,7 +286,7 @@ class SessionClient:
             await self.contact(self.load.feed(tick))
         if not realtime:
             known = None if self.load is None else self.load.known_until
-            await self.contact(self.control.write(Grant(until if known is None else min(until, known))))
+            await self.contact(self.control.write(control_plc.Grant(until if known is None else min(until, known))))
 
     async def look(self) -> int | None:
         """Record what has happened since the last look; return the plant's tick, None when it does not answer.
@@ -307,12 +307,12 @@ class SessionClient:
             await self.contact(self._events.look(PLANT))
         return tick
 
-    async def ladder(self) -> LadderStatus | None:
+    async def ladder(self) -> control_plc.LadderStatus | None:
         """Return the state of the fail-safe ladder, and record the events of the control PLC when there are new ones.
 
         None when it does not answer.
         """
-        ladder = await self.contact(self.control.read(LadderStatus))
+        ladder = await self.contact(self.control.read(control_plc.LadderStatus))
         if ladder is None or ladder.events == self._noted_events:
             return ladder
         if await self.contact(self._events.read(CONTROL)) is None:
@@ -373,7 +373,7 @@ class _FromNow:
     def station(self, sample: plant.StationSample) -> None:
         self._recorder.station(sample._replace(tick=sample.tick - self._tick))
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         if update.tick >= self._tick and update.update >= self._update:
             self._recorder.update(update._replace(tick=update.tick - self._tick, update=update.update - self._update))
 
@@ -393,20 +393,20 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
         UsageError: The rig has no session.
         LinkError: The plant does not answer for long, or is in another session.
     """
-    identity, last = await find_session(rig), await last_update(rig.optimizer)
+    identity, last = await find_session(rig), await observer.last_update(rig.optimizer)
     first_update = 0 if last is None else last.update + 1
     from_now = _FromNow(recorder, identity.tick, first_update)
-    readers = {service: JournalReader(rig.clients[service]) for service in (CONTROL, PLANT)}
+    readers = {service: observer.JournalReader(rig.clients[service]) for service in (CONTROL, PLANT)}
     for service, reader in readers.items():
         for event in state_of(await reader.read_on(), identity.tick):
             from_now.event(event, service)
     events = SessionEvents(readers, from_now)
     number, end = identity.session, identity.tick + scenario.ticks
-    samples = SampleReader(
+    samples = observer.SampleReader(
         rig.plant, from_now, number, end, first=identity.tick, tolerant=True, realtime=scenario.realtime
     )
-    updates = UpdateReader(rig.optimizer, from_now.update, number, first=first_update, tolerant=True)
-    late = Lateness(await rig.control.read(Status))
+    updates = observer.UpdateReader(rig.optimizer, from_now.update, number, first=first_update, tolerant=True)
+    late = Lateness(await rig.control.read(control_plc.Status))
     recorder.begin()
     heard_at = time.monotonic()
     try:
@@ -417,7 +417,7 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
                 raise LinkError(f"{rig.plant.peer} has not answered for {QUIET_S:g} s")
             await rig.contact(updates.read())
             await rig.contact(events.look(CONTROL, PLANT))
-            recorder.link = late.after(await rig.contact(rig.control.read(Status)))
+            recorder.link = late.after(await rig.contact(rig.control.read(control_plc.Status)))
             pause_s = rig.plant.process.tick_s / scenario.factor if scenario.realtime else 0.0
             await asyncio.sleep(min(max(pause_s, 2 * SHORTEST_PAUSE_S), LONGEST_PAUSE_S))
     finally:  # reports what ended the recording, not a failed read of its last part
@@ -425,7 +425,7 @@ async def record_session(rig: SessionClient, scenario: Scenario, recorder: Recor
             with contextlib.suppress(LinkError):
                 await rig.contact(read())
         with contextlib.suppress(LinkError):
-            recorder.link = late.after(await rig.contact(rig.control.read(Status)))
+            recorder.link = late.after(await rig.contact(rig.control.read(control_plc.Status)))
 
 
 def state_of(events: Iterable[Event], tick: int) -> list[Event]:
@@ -456,11 +456,11 @@ def state_of(events: Iterable[Event], tick: int) -> list[Event]:
 class Lateness:
     """Counts what was late since a first look, also where the control PLC was restarted and counts from 0."""
 
-    def __init__(self, first: Status) -> None:
+    def __init__(self, first: control_plc.Status) -> None:
         self._before = first
         self._late = LinkStatistics(0, 0, first.lateness_max, first.lateness_p99)
 
-    def after(self, status: Status | None) -> LinkStatistics:
+    def after(self, status: control_plc.Status | None) -> LinkStatistics:
         """Return what was late up to a look, None where there was no answer; the largest lateness is of the session."""
         if status is not None:
             before, self._before, late = self._before, status, self._late
@@ -478,7 +478,7 @@ class SavedSession(NamedTuple):
     """State of a rig when the client attached."""
 
     pace: SessionPace
-    operator: Operator
+    operator: control_plc.Operator
     load: LoadProfile
     """Load from that tick on, W."""
 
@@ -492,7 +492,7 @@ async def save_session(rig: SessionClient) -> SavedSession | None:
     identity, pace = await rig.plant.read(Identity), await rig.plant.read(SessionPace)
     if not identity.session or not pace.realtime:
         return None
-    operator, now = await rig.control.read(Operator), identity.tick
+    operator, now = await rig.control.read(control_plc.Operator), identity.tick
     status, asked = await rig.plant.read(plant.LoadStatus), await rig.plant.read(plant.PlantSession)
     steps: list[plant.LoadStep] = []
     if status.upcoming:
@@ -519,14 +519,14 @@ async def restore_session(rig: SessionClient, saved: SavedSession | None, sessio
         identity = await rig.plant.read(Identity)
         if identity.session != session:
             return
-        await write_pace(rig.clients, saved.pace._replace(session=0))
-        if saved.operator.mode != OperatorMode.AUTO:
+        await execution.write_pace(rig.clients, saved.pace._replace(session=0))
+        if saved.operator.mode != control_plc.OperatorMode.AUTO:
             await rig.control.write(saved.operator)
         tick = (await rig.plant.read(Identity)).tick
-        await rig.plant.write(sealed(plant.LiveLoad(0, saved.load.watts[0]), rig.plant.map))
+        await rig.plant.write(codec.sealed(plant.LiveLoad(0, saved.load.watts[0]), rig.plant.map))
         coming = LoadProfile(saved.load.times, saved.load.watts)
-        await LoadStream(
-            rig.plant, session, coming, begin=tick + lead_ticks(saved.pace, rig.plant.process.tick_s)
+        await execution.LoadStream(
+            rig.plant, session, coming, begin=tick + execution.lead_ticks(saved.pace, rig.plant.process.tick_s)
         ).feed(tick)
     except LinkError as error:
         log.warning("the rig was not restored: %s", error)

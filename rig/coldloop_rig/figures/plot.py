@@ -18,14 +18,10 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import ScalarFormatter
 from numpy.typing import NDArray
 
-from coldloop.errors import UsageError
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
-from coldloop.process.sections import Input, Output
-from coldloop.text import axis_labels, ends_text, number_text, whole_file
+from coldloop import errors, text
+from coldloop.process import cold_box, declaration, sections
+from coldloop_rig.results import recording, run_folder
 from coldloop_rig.results.columns import STATION, excess_keys
-from coldloop_rig.results.recording import Way
-from coldloop_rig.results.run_folder import Curves, RunFolder, writing
 from coldloop_rig.text_tables import aligned
 
 Series = NDArray[np.floating]
@@ -49,10 +45,14 @@ def with_unit(name: str, unit: str) -> str:
 
 
 @cache
-def labels_of(process: Process) -> Mapping[str, str]:
+def labels_of(process: declaration.Process) -> Mapping[str, str]:
     """Return the columns of the trace that are drawn, in their order, with the labels of their axes."""
     load = {process.load.column: with_unit(process.load.title, process.load.unit)} if process.has_load else {}
-    signals: tuple[Input | Output, ...] = (*process.measured_disturbances, *process.banded, *process.inputs)
+    signals: tuple[sections.Input | sections.Output, ...] = (
+        *process.measured_disturbances,
+        *process.banded,
+        *process.inputs,
+    )
     named = {one.name: with_unit(one.name, one.unit) for one in signals}
     return {**load, **named, "tau_u_s": "tau_u (s)", "stage_cost": "stage cost (1)"}
 
@@ -81,7 +81,7 @@ Edges = Mapping[str, tuple[float, float]]
 """Bands of the outputs and limits of the inputs: lowest and highest value, by column."""
 
 
-def edges_of(configuration: Mapping[str, Any], process: Process) -> Edges:
+def edges_of(configuration: Mapping[str, Any], process: declaration.Process) -> Edges:
     """Return the bands and limits of a configuration by dotted key."""
     found: dict[str, tuple[float, float]] = {}
     names = tuple(one.name for one in process.banded)
@@ -94,7 +94,7 @@ def edges_of(configuration: Mapping[str, Any], process: Process) -> Edges:
 class RunCurves(NamedTuple):
     """Curves, events and texts of the figure of a run."""
 
-    process: Process
+    process: declaration.Process
     series: Mapping[str, Series]
     """`time_s` and the columns of `labels_of`."""
     events: Sequence[Mapping[str, Any]]
@@ -124,12 +124,12 @@ def draw_run(curves: RunCurves) -> Figure:
                 place.set_ylabel(label)
             if (edges := curves.edges.get(name)) is not None:
                 what = "bounds" if name in process.input_names else "band"
-                limit(place, curves.series[name], edges, f"{what} {ends_text(*edges)} {units[name]}".rstrip())
+                limit(place, curves.series[name], edges, f"{what} {text.ends_text(*edges)} {units[name]}".rstrip())
         behind = len(labels) - len(NOT_CURVES)
         for place, (name, ends) in zip(axes[behind:], curves.pressures.items(), strict=False):
             place.plot(time, curves.series[name], color=INK, linewidth=1, label=name, drawstyle="steps-post")
             place.set_ylabel(f"{name} (bar)")
-            limit(place, curves.series[name], ends, f"no alarm from {ends_text(*ends)} bar")
+            limit(place, curves.series[name], ends, f"no alarm from {text.ends_text(*ends)} bar")
         behind += len(curves.pressures)
         place, tau_u = axes[behind], curves.series["tau_u_s"]
         place.set_ylabel("tau_u (s)")
@@ -162,7 +162,7 @@ class MarkLabels(ScalarFormatter):
 
     def format_ticks(self, values: Sequence[float]) -> list[str]:
         """Return the labels of the marks."""
-        return axis_labels(values)
+        return text.axis_labels(values)
 
 
 def label_marks(figure: Figure) -> None:
@@ -286,7 +286,7 @@ def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
         OSError: A file cannot be written.
         UsageError: There is no run in the folder.
     """
-    figure = draw_run(curves_of(RunFolder(folder)))
+    figure = draw_run(curves_of(run_folder.RunFolder(folder)))
     paths = [folder / f"run.{extension}" for extension in formats]
     for path in paths:
         save_figure(figure, path)
@@ -295,8 +295,8 @@ def plot_run(folder: Path, formats: Sequence[str]) -> list[Path]:
 
 def draw_nothing() -> None:
     """Draw one tick into memory: fonts, and what else the first figure of a process needs, are loaded then."""
-    series = {name: np.zeros(1) for name in ("time_s", *labels_of(COLD_BOX))}
-    draw_run(RunCurves(COLD_BOX, series, [], {"L1": (0.0, 1.0)}, "", "")).savefig(BytesIO(), dpi=DPI)
+    series = {name: np.zeros(1) for name in ("time_s", *labels_of(cold_box.COLD_BOX))}
+    draw_run(RunCurves(cold_box.COLD_BOX, series, [], {"L1": (0.0, 1.0)}, "", "")).savefig(BytesIO(), dpi=DPI)
 
 
 def save_figure(figure: Figure, path: Path) -> None:
@@ -305,10 +305,10 @@ def save_figure(figure: Figure, path: Path) -> None:
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}.get(extension)
     dpi = max(DPI, 900 / figure.get_figwidth())  # so many pixels across where it is narrow on paper
     with styled():
-        whole_file(path, lambda draft: figure.savefig(draft, dpi=dpi, format=extension, metadata=metadata))
+        text.whole_file(path, lambda draft: figure.savefig(draft, dpi=dpi, format=extension, metadata=metadata))
 
 
-def curves_of(run: RunFolder) -> RunCurves:
+def curves_of(run: run_folder.RunFolder) -> RunCurves:
     """Return what is drawn of a run."""
     pressures = pressure_limits(run.configuration) if (run.path / STATION).exists() else {}
     process, configuration = run.process, run.configuration
@@ -328,16 +328,16 @@ def pressure_limits(configuration: Mapping[str, Any]) -> dict[str, tuple[float, 
     }
 
 
-def at_times(series: Curves, times_s: NDArray[np.float64]) -> Curves:
+def at_times(series: run_folder.Curves, times_s: NDArray[np.float64]) -> run_folder.Curves:
     """Return the curves of a file at the times of another one."""
     known = series["time_s"]
     return {n: np.interp(times_s, known, curve, np.nan, np.nan) for n, curve in series.items() if n != "time_s"}
 
 
-def title_of(configuration: Mapping[str, Any], process: Process, way: str = "") -> str:
+def title_of(configuration: Mapping[str, Any], process: declaration.Process, way: str = "") -> str:
     """Return what a run was, in a few words; of a session that was recorded, the load is not known by name."""
     named = f"load {Path(configuration['plant.load']).name}" if process.has_load else process.name
-    load = "session under way" if way == Way.RECORDED else named
+    load = "session under way" if way == recording.Way.RECORDED else named
     if configuration["control_plc.driver"] == "classical":
         return f"{load}, classical loops"
     period = configuration["optimizer_plc.program.updating_period_s"]
@@ -371,14 +371,16 @@ def compare(paths: Sequence[Path], out: Path) -> str:
         UsageError: A folder has no run, or one of another process.
         ResultsError: The figure cannot be written.
     """
-    runs = [RunFolder(path) for path in paths]
+    runs = [run_folder.RunFolder(path) for path in paths]
     process = runs[0].process
     for run in runs:
         if labels_of(run.process) != labels_of(process):
-            raise UsageError(f"{run.path}: a run of {run.process.name}, and not of {process.name}; compare runs of one")
+            raise errors.UsageError(
+                f"{run.path}: a run of {run.process.name}, and not of {process.name}; compare runs of one"
+            )
     names = [path.resolve().name for path in paths]
     labels = names if len(set(names)) == len(names) else [str(path) for path in paths]
-    with writing(out):
+    with run_folder.writing(out):
         save_figure(_draw_comparison(runs, labels), out)
     summaries, rows = [run.summary for run in runs], [["", *labels]]
     shares = (f"{one.name}_outside_band_pct" for one in process.banded)
@@ -394,11 +396,11 @@ def _cell(value: Any) -> str:  # noqa: ANN401 a value of a JSON document
     if value is None:
         return "-"
     if isinstance(value, float):
-        return number_text(value, 5)
+        return text.number_text(value, 5)
     return f"{value[:12]}" if isinstance(value, str) and len(value) == 64 else str(value)
 
 
-def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure:
+def _draw_comparison(runs: Sequence[run_folder.RunFolder], labels: Sequence[str]) -> Figure:
     named = labels_of(runs[0].process)
     curves = [run.series([*named]) for run in runs]
     scale_s, unit = time_unit(max((one["time_s"] for one in curves), key=lambda times: float(times[-1])))
@@ -414,7 +416,7 @@ def _draw_comparison(runs: Sequence[RunFolder], labels: Sequence[str]) -> Figure
         process = runs[0].process
         for name, edges in edges_of(runs[0].configuration, process).items():
             what = "bounds" if name in process.input_names else "band"
-            limit(axes[name], np.concatenate([one[name] for one in curves]), edges, f"{what} {ends_text(*edges)}")
+            limit(axes[name], np.concatenate([one[name] for one in curves]), edges, f"{what} {text.ends_text(*edges)}")
         axes["tau_u_s"].set_ylim(0, process.sampling_period_s + 0.3)
         axes["stage_cost"].set_yscale("log")
         axes["stage_cost"].set_ylim(bottom=LEAST_COST)
@@ -442,7 +444,7 @@ def run_page(folder: Path) -> str:
     from jinja2 import Environment, PackageLoader, StrictUndefined  # noqa: PLC0415 an extra
     from plotly.offline import get_plotlyjs  # noqa: PLC0415 an extra
 
-    run = RunFolder(folder)
+    run = run_folder.RunFolder(folder)
     manifest = run.manifest
     environment = Environment(
         loader=PackageLoader("coldloop_rig", "figures"), autoescape=True, trim_blocks=True, undefined=StrictUndefined
@@ -465,10 +467,10 @@ def run_page(folder: Path) -> str:
 def _shown(value: object) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
-    return "-" if value is None else number_text(value, 6) if isinstance(value, float) else str(value)
+    return "-" if value is None else text.number_text(value, 6) if isinstance(value, float) else str(value)
 
 
-def _plots(run: RunFolder) -> str:
+def _plots(run: run_folder.RunFolder) -> str:
     """Return the curves as an HTML element."""
     from plotly.graph_objects import Scattergl  # noqa: PLC0415 an extra
     from plotly.subplots import make_subplots  # noqa: PLC0415 an extra

@@ -12,8 +12,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Final, Self
 
-from coldloop.errors import ColdloopError, ResultsError, UsageError
-from coldloop.text import parsed_json
+from coldloop import errors, text
 from coldloop_rig import PYTHON
 
 COMMAND: Final = (*PYTHON, "-m", "coldloop_rig.figures.worker")
@@ -58,9 +57,9 @@ class FigureProcess:
         _, said = process.communicate(json.dumps([str(folder), self._formats]).encode())
         if process.returncode:
             lines = said.decode(errors="replace").strip().splitlines() or [f"exit code {process.returncode}"]
-            if process.returncode == UsageError.exit_code:
-                raise UsageError(lines[-1])
-            raise ResultsError(
+            if process.returncode == errors.UsageError.exit_code:
+                raise errors.UsageError(lines[-1])
+            raise errors.ResultsError(
                 f"{folder}: the figure was not drawn: {lines[-1]}; try `coldloop plot {folder}`, the rest is complete"
             )
 
@@ -73,10 +72,10 @@ def main() -> None:
     request = sys.stdin.buffer.read()
     if not request:
         return
-    folder, formats = parsed_json(request)
+    folder, formats = text.parsed_json(request)
     try:
         plot_run(Path(folder), formats)
-    except (OSError, ColdloopError) as error:
+    except (OSError, errors.ColdloopError) as error:
         sys.stderr.write(f"{error}\n")
         sys.exit(getattr(error, "exit_code", 1))
     gc.freeze()  # do not search all modules for cycles at the exit

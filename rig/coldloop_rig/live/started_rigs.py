@@ -27,9 +27,8 @@ from pydantic import Field, TypeAdapter, ValidationError
 from coldloop.errors import ColdloopError, UsageError
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, PLANT_PORT
 from coldloop.text import replace_file
-from coldloop_rig import PYTHON
+from coldloop_rig import PYTHON, interruption
 from coldloop_rig.cosim.wiring import REQUIRED, RigEndpoints
-from coldloop_rig.interruption import INTERRUPTION
 
 T = TypeVar("T", bound=tuple[Any, ...])
 MOST_BYTES: Final = 65536
@@ -398,7 +397,7 @@ def detached(ports: Sequence[int], lock: int) -> int:
     folder = state_folder(ports[0])
     output = folder / "up.log"
     ended_by: list[signal.Signals] = []
-    with new_own(output) as log, INTERRUPTION.passed_to(ended_by.append):
+    with new_own(output) as log, interruption.INTERRUPTION.passed_to(ended_by.append):
         process = subprocess.Popen(  # noqa: S603 our own command
             [*PYTHON, "-m", "coldloop_rig", *sys.argv[1:], "--locked", str(lock)],
             stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, pass_fds=[lock],

@@ -6,20 +6,17 @@ from contextlib import AsyncExitStack, nullcontext
 from typing import Any, Final, NamedTuple
 
 from coldloop.errors import LinkError, PeerUnreachableError, RequestRefusedError
-from coldloop.operating.execution import Clients, CommandClient, clients_of, connected, reason_of
-from coldloop.operating.observer import last_update, read_alarms
+from coldloop.operating import execution, observer
 from coldloop.process.declaration import Process
-from coldloop.registers.common import AlarmState, Identity, SessionPace
-from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode, ProcessNow
-from coldloop.registers.optimizer_plc import Optimization
+from coldloop.registers import common, control_plc, optimizer_plc
 from coldloop.registers.plant import LoadStatus
 from coldloop.service.journal import alarm_cause, alarm_word
 from coldloop.text import value_text
 from coldloop_rig.cosim.wiring import RigEndpoints, answered_in_time
 from coldloop_rig.text_tables import Colour, coloured
 
-Work = Callable[[Clients], Awaitable[str]]
-QUIET: Final = (AlarmState.NORMAL, AlarmState.SHELVED, AlarmState.OUT_OF_SERVICE)
+Work = Callable[[execution.Clients], Awaitable[str]]
+QUIET: Final = (common.AlarmState.NORMAL, common.AlarmState.SHELVED, common.AlarmState.OUT_OF_SERVICE)
 
 
 async def ask(rig: RigEndpoints, process: Process, services: Iterable[str], work: Work, *, limited: bool = True) -> str:
@@ -31,30 +28,30 @@ async def ask(rig: RigEndpoints, process: Process, services: Iterable[str], work
         LinkError: A service is not there, refuses, or answers too late.
         UsageError: It is not possible now.
     """
-    clients = clients_of({service: getattr(rig, service) for service in services}, process)
+    clients = execution.clients_of({service: getattr(rig, service) for service in services}, process)
     async with AsyncExitStack() as stack:
         async with answered_in_time("to connect"):
-            await stack.enter_async_context(connected(clients))
+            await stack.enter_async_context(execution.connected(clients))
         async with answered_in_time("the command") if limited else nullcontext():
             try:
                 return await work(clients)
             except RequestRefusedError as error:
-                raise LinkError(reason_of(error)) from None
+                raise LinkError(execution.reason_of(error)) from None
 
 
 class PlantStatus(NamedTuple):
     """Status of the plant at one time."""
 
-    identity: Identity
-    pace: SessionPace
+    identity: common.Identity
+    pace: common.SessionPace
     load: LoadStatus
 
 
 class ControlStatus(NamedTuple):
     """Status of the control PLC at one time."""
 
-    ladder: LadderStatus
-    operator: Operator
+    ladder: control_plc.LadderStatus
+    operator: control_plc.Operator
     y: tuple[float, ...]
     """Outputs of the last scan; all are 0 before the first."""
     alarms: tuple[str, ...]
@@ -67,19 +64,19 @@ class RigStatus(NamedTuple):
     plant: PlantStatus | None
     """State of the plant; None if it does not answer, as with the fields below."""
     control: ControlStatus | None
-    update: Optimization | None
+    update: optimizer_plc.Optimization | None
     """The last one that was done; None before the first as well, and of an optimiser that is not ours."""
     silent: tuple[str, ...] = ()
     """Messages about the services that do not answer, one each."""
 
 
-async def read_status(clients: Clients) -> RigStatus:
+async def read_status(clients: execution.Clients) -> RigStatus:
     """Return the state of a rig, of which some services may be away.
 
     Raises:
         LinkError: Neither the plant nor the control PLC answers, or an answer is not possible.
     """
-    readers = {"plant": _plant, "control_plc": _control, "optimizer_plc": last_update}
+    readers = {"plant": _plant, "control_plc": _control, "optimizer_plc": observer.last_update}
     names = [name for name in readers if name in clients]
     answers = await asyncio.gather(*(_answer(readers[name], clients[name]) for name in names))
     found: dict[str, Any] = dict(zip(names, answers, strict=True))
@@ -92,7 +89,7 @@ async def read_status(clients: Clients) -> RigStatus:
     return RigStatus(clients[names[0]].process, plant, control, update, tuple(map(str, absent)))
 
 
-async def _answer(read: Callable[[CommandClient], Awaitable[Any]], client: CommandClient) -> Any:  # noqa: ANN401 any
+async def _answer(read: Callable[[execution.CommandClient], Awaitable[Any]], client: execution.CommandClient) -> Any:  # noqa: ANN401 any
     try:
         async with answered_in_time("to read the status"):
             await client.connect(0.0)
@@ -101,20 +98,24 @@ async def _answer(read: Callable[[CommandClient], Awaitable[Any]], client: Comma
         return error
 
 
-async def _plant(client: CommandClient) -> PlantStatus:
-    return PlantStatus(await client.read(Identity), await client.read(SessionPace), await client.read(LoadStatus))
+async def _plant(client: execution.CommandClient) -> PlantStatus:
+    return PlantStatus(
+        await client.read(common.Identity), await client.read(common.SessionPace), await client.read(LoadStatus)
+    )
 
 
-async def _control(client: CommandClient) -> ControlStatus:
-    rows, process = await read_alarms(client), client.process
+async def _control(client: execution.CommandClient) -> ControlStatus:
+    rows, process = await observer.read_alarms(client), client.process
     causes = [f" ({cause})" if (cause := alarm_cause(i, row.cause, process)) else "" for i, row in enumerate(rows)]
     alarms = tuple(
-        f"{alarm_word(i, process)}{causes[i]}, {AlarmState.word_of(row.state)}"
+        f"{alarm_word(i, process)}{causes[i]}, {common.AlarmState.word_of(row.state)}"
         for i, row in enumerate(rows)
         if row.state not in QUIET
     )
-    y = (await client.read(ProcessNow)).y
-    return ControlStatus(await client.read(LadderStatus), await client.read(Operator), y, alarms)
+    y = (await client.read(control_plc.ProcessNow)).y
+    return ControlStatus(
+        await client.read(control_plc.LadderStatus), await client.read(control_plc.Operator), y, alarms
+    )
 
 
 def _pace(plant: PlantStatus) -> str:
@@ -134,7 +135,7 @@ def colour(status: RigStatus) -> Colour:
     """Return the colour of a state: good is MPC without an alarm, failed is a service that does not answer."""
     if status.silent or status.control is None:
         return Colour.FAILED
-    good = status.control.ladder.mode == Mode.MPC and not status.control.alarms
+    good = status.control.ladder.mode == control_plc.Mode.MPC and not status.control.alarms
     return Colour.GOOD if good else Colour.ATTENTION
 
 
@@ -145,9 +146,9 @@ def page(status: RigStatus) -> str:
     if plant is not None:
         rows.append(("session", f"{plant.identity.session}, {_pace(plant)}, {plant.identity.tick * tick_s:.2f} s"))
     if control is not None:
-        mode, cause = Mode.word_of(control.ladder.mode), Cause.word_of(control.ladder.cause)
+        mode, cause = control_plc.Mode.word_of(control.ladder.mode), control_plc.Cause.word_of(control.ladder.cause)
         rows.append(("mode", f"{mode} ({cause}) since {control.ladder.since * tick_s:g} s"))
-        rows.append(("operator", OperatorMode.word_of(control.operator.mode)))
+        rows.append(("operator", control_plc.OperatorMode.word_of(control.operator.mode)))
     if plant is not None and process.has_load:
         load, unit = plant.load, process.load.unit
         then = f", {value_text(load.next_watts, unit)} from {load.next_tick * tick_s:g} s" if load.upcoming else ""
@@ -168,7 +169,7 @@ def line(status: RigStatus) -> str:
     """Return the state as one line."""
     plant, control, process = status.plant, status.control, status.process
     parts = ["no plant  "] if plant is None else [f"{plant.identity.tick * process.tick_s:10.2f} s"]
-    parts.append("no control PLC" if control is None else f"{Mode.word_of(control.ladder.mode):9}")
+    parts.append("no control PLC" if control is None else f"{control_plc.Mode.word_of(control.ladder.mode):9}")
     if plant is not None and process.has_load:
         parts.append(f"{plant.load.watts:6.1f} {process.load.unit}")
     if control is not None:

@@ -19,19 +19,15 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import Field
 
-from coldloop.config import to_environment
-from coldloop.errors import ColdloopError, LinkError, PeerUnreachableError, UsageError
+from coldloop import config, errors
 from coldloop.modbus.settings import TlsSettings
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.registers import maps_of
-from coldloop.registers.common import Identity
-from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus
+from coldloop.registers import common, control_plc, maps_of
 from coldloop.registers.plant import Measurement
 from coldloop_hmi.settings import HmiSection, HmiSettings
 from coldloop_hmi.users import PageRole, write_user
 from coldloop_rig import PYTHON
-from coldloop_rig.cosim import networked_run, wiring
-from coldloop_rig.cosim.scenario import with_copied_load
+from coldloop_rig.cosim import networked_run, scenario, wiring
 from coldloop_rig.cosim.session import SessionClient
 from coldloop_rig.live import started_rigs
 from coldloop_rig.runs.running import make_scenario
@@ -103,14 +99,14 @@ async def cut(first_port: int | None, link: str, seconds: float) -> None:
     """
     rig = started_rigs.require_rig(first_port)
     if not rig.cuttable:
-        raise UsageError("the links of this rig cannot be cut: start it with `coldloop up --cuttable`")
+        raise errors.UsageError("the links of this rig cannot be cut: start it with `coldloop up --cuttable`")
     file = started_rigs.state_folder(rig.ports[0]) / CUT_FILES.replace("*", secrets.token_hex(8))
     started_rigs.write_own(file, json.dumps([link, seconds]))
     deadline = time.monotonic() + TAKEN_S
     try:
         while file.exists():
             if time.monotonic() > deadline:
-                raise ColdloopError(f"the rig (process {rig.pid}) has not cut the link within {TAKEN_S:g} s")
+                raise errors.ColdloopError(f"the rig (process {rig.pid}) has not cut the link within {TAKEN_S:g} s")
             await asyncio.sleep(CUT_LOOK_S)
     finally:
         file.unlink(missing_ok=True)
@@ -123,15 +119,15 @@ def check_page(section: HmiSection) -> None:
         UsageError: It has no port, its extra is not installed, or its port is in use.
     """
     if not section.port:
-        raise UsageError("the page needs a fixed port: give one with --page-port")
+        raise errors.UsageError("the page needs a fixed port: give one with --page-port")
     if find_spec("aiohttp") is None:
-        raise UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
+        raise errors.UsageError("--page needs aiohttp: pip install 'coldloop[hmi]'")
     with socket.socket(socket.AF_INET6 if ":" in section.host else socket.AF_INET) as one:
         one.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             one.bind((section.host, section.port))
         except OSError as error:
-            raise UsageError(
+            raise errors.UsageError(
                 f"port {section.port} of the page: {error.strerror}; give another one with --page-port"
             ) from None
 
@@ -192,7 +188,7 @@ class PageProcess:
     def __init__(self, settings: HmiSettings | Settings, endpoints: wiring.RigEndpoints, folder: Path) -> None:
         self._log = folder / "logs" / "hmi.log"
         self._section, self._login = with_own_files(pointed_at(settings.hmi, endpoints), folder)
-        self._environment = to_environment(HmiSettings(model=settings.model, hmi=self._section))
+        self._environment = config.to_environment(HmiSettings(model=settings.model, hmi=self._section))
         self._process: asyncio.subprocess.Process | None = None
 
     async def __aenter__(self) -> Self:
@@ -227,7 +223,7 @@ class PageProcess:
         """
         while True:
             if self._process is not None and self._process.returncode is not None:
-                raise LinkError(f"the page {await self.ended()}")
+                raise errors.LinkError(f"the page {await self.ended()}")
             try:
                 _, writer = await asyncio.open_connection(self._section.host, self._section.port)
             except OSError:
@@ -270,7 +266,7 @@ class UpRig:
             ColdloopError: The session could not begin, or a service has ended again and again.
         """
         links = self._links
-        settings = with_copied_load(self._settings, self._scenario.load, self.folder)
+        settings = scenario.with_copied_load(self._settings, self._scenario.load, self.folder)
         services = networked_run.LocalServices(
             settings, started_rigs.make_private(self.folder / "logs"), links=None if links is None else links.proxies,
             ports=self._ports, services=self._services, optimizer=self._optimizer,
@@ -308,14 +304,14 @@ class UpRig:
         started_rigs.RunningRig.write(self._ports, tls, pids, cuttable=self._links is not None)
 
     async def _keep(self, services: networked_run.LocalServices, rig: SessionClient, page: PageProcess | None) -> None:
-        def unwritten(error: LinkError) -> None:
-            if not isinstance(error, PeerUnreachableError):  # else the plant is being started again
+        def unwritten(error: errors.LinkError) -> None:
+            if not isinstance(error, errors.PeerUnreachableError):  # else the plant is being started again
                 networked_run.say(f"the rest of the load is not written: {error}")
 
         async def keep_page(page: PageProcess) -> None:
             try:
                 await networked_run.keep_up("the page", page.ended, page.restart)
-            except LinkError as error:  # the rig keeps running without it
+            except errors.LinkError as error:  # the rig keeps running without it
                 networked_run.say(str(error))
 
         work = [rig.hold(LOOK_S, unwritten), *(self._keep_service(services, each, rig) for each in self._services)]
@@ -338,7 +334,7 @@ class UpRig:
             except OSError as error:  # commands cannot find this process; the rig keeps running
                 networked_run.say(f"{error.filename}: {error.strerror}")
             while service in wiring.RETAINING:  # the optimiser learns it from the control PLC
-                with suppress(LinkError):  # another one has ended, too
+                with suppress(errors.LinkError):  # another one has ended, too
                     await rig.clients[service].connect(wiring.START_PATIENCE_S)
                     if await self._goes_on(service, rig):
                         return
@@ -353,9 +349,12 @@ class UpRig:
         Not yet, while the control PLC is looking for the one that it has retained.
         """
         async with self._sessions:
-            state = (await rig.control.read(PlantLinkStatus)).state
-            looking = state in (PlantLinkState.SEARCHING, PlantLinkState.JOINING)
-            plant, control = (await rig.plant.read(Identity)).session, (await rig.control.read(Identity)).session
+            state = (await rig.control.read(control_plc.PlantLinkStatus)).state
+            looking = state in (control_plc.PlantLinkState.SEARCHING, control_plc.PlantLinkState.JOINING)
+            plant, control = (
+                (await rig.plant.read(common.Identity)).session,
+                (await rig.control.read(common.Identity)).session,
+            )
             if plant == control != 0:
                 return True
             if plant and looking:

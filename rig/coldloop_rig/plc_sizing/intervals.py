@@ -34,12 +34,11 @@ from coldloop_optimizer_plc.qp.problem import QuadraticProblem
 from coldloop_optimizer_plc.settings import SolverName
 from coldloop_optimizer_plc.solvers import Solver, make_solver
 from coldloop_plant.load import HOURS, drawn, find_load
+from coldloop_rig import progress, text_tables
 from coldloop_rig.cosim.one_process import OneProcessRig, run_ideal_loop
 from coldloop_rig.cosim.scenario import Scenario, natural_ticks
-from coldloop_rig.progress import make_console
 from coldloop_rig.results.recording import Recorder, evaluate
 from coldloop_rig.settings import Settings
-from coldloop_rig.text_tables import aligned
 
 TAIL: Final = 0.025  # probability on each side of an interval
 MOST_CHANGE: Final = 2.0  # change of a logarithm when a draw is left out, up to which it is taken for smooth
@@ -239,7 +238,7 @@ def certification_table(settings: Settings, scenarios: int, tolerance_pct: float
         with suppress(ConfigurationError):  # it is not installed
             solvers[name] = make_solver(program.model_copy(update={"solver": name}))
     needs: dict[SolverName, list[Needs]] = {name: [] for name in solvers}
-    with make_console().status("") as status:
+    with progress.make_console().status("") as status:
         for number in range(scenarios):
             problems = scenario_problems(settings, number)
             for name, solver in solvers.items():
@@ -265,7 +264,7 @@ def certification_table(settings: Settings, scenarios: int, tolerance_pct: float
         at_random = failed([one.at_random for one in needs[name]], fitting, beta)
         most = f"{max(worst)}" if max(worst) <= LONGEST else f"over {LONGEST}"
         rows.append((name, f"{fitting}", *at_random, *failed(worst, fitting, beta), most))
-    return heading + aligned(rows, numbers=True)
+    return heading + text_tables.aligned(rows, numbers=True)
 
 
 # -- whether an adaptive period pays -----------------------------------------------------------------------------------

@@ -14,10 +14,8 @@ import numpy as np
 from pydantic import BaseModel, Field, PositiveFloat, ValidationError, field_validator, model_validator
 from scipy.optimize import nnls
 
-from coldloop.config import load_configuration
-from coldloop.errors import ConfigurationError, UsageError
+from coldloop import config, errors, text
 from coldloop.table import read_table
-from coldloop.text import held_file, parsed_json, read_bytes
 from coldloop_optimizer_plc.qp.linear_algebra import Array
 from coldloop_rig.plc_sizing.operations import dense_cholesky
 from coldloop_rig.text_tables import markdown_table
@@ -141,12 +139,12 @@ def find_profile(name: str) -> PlcProfile:
         with as_file(SHIPPED) as folder:
             return _read(folder / f"{name}.toml")
     if not os.path.exists(name):  # noqa: PTH110 a path raises an error where a name is too long
-        raise UsageError(f"--plc {name}: neither a file nor one of {', '.join(shipped_profiles())}")
+        raise errors.UsageError(f"--plc {name}: neither a file nor one of {', '.join(shipped_profiles())}")
     return _read(Path(name))
 
 
 def _read(path: Path) -> PlcProfile:
-    profile = load_configuration(PlcProfile, file=path, environment={}, option="--plc", listing=LISTING).settings
+    profile = config.load_configuration(PlcProfile, file=path, environment={}, option="--plc", listing=LISTING).settings
     if profile.factorisations is None:
         return profile
     return profile.model_copy(update={"factorisations": path.parent / profile.factorisations})
@@ -154,22 +152,24 @@ def _read(path: Path) -> PlcProfile:
 
 def _times(path: Path) -> tuple[Array, Array]:
     """Return sizes, in rising order, and times in seconds."""
-    table = read_table(path, TIMES_HEADER, "name a CSV file with `factorisations`", ConfigurationError)
+    table = read_table(path, TIMES_HEADER, "name a CSV file with `factorisations`", errors.ConfigurationError)
     found: dict[float, float] = {}
     for (number, _), size, plc_ms in zip(table.rows, *table.columns(TIMES_HEADER), strict=True):
         if not (1.0 <= size <= LARGEST_SIZE and SHORTEST_MS <= plc_ms <= LONGEST_MS):
-            raise ConfigurationError(
+            raise errors.ConfigurationError(
                 f"{path}: line {number}: sizes are from 1 to {LARGEST_SIZE}, times from {SHORTEST_MS:g} to "
                 f"{LONGEST_MS:g} ms"
             )
         if size in found:
-            raise ConfigurationError(f"{path}: line {number}: the size {size:g} is there twice; leave one time of it")
+            raise errors.ConfigurationError(
+                f"{path}: line {number}: the size {size:g} is there twice; leave one time of it"
+            )
         found[size] = plc_ms * 1e-3
     if len(found) < FEWEST_SIZES:
-        raise ConfigurationError(f"{path}: {len(found)} sizes; the curve needs {FEWEST_SIZES} or more")
+        raise errors.ConfigurationError(f"{path}: {len(found)} sizes; the curve needs {FEWEST_SIZES} or more")
     sizes, times = np.array(sorted(found)), np.array([found[size] for size in sorted(found)])
     if (np.diff(times) <= 0.0).any():
-        raise ConfigurationError(f"{path}: a larger size takes no longer than a smaller one; times have to rise")
+        raise errors.ConfigurationError(f"{path}: a larger size takes no longer than a smaller one; times have to rise")
     return sizes, times
 
 
@@ -236,9 +236,11 @@ class ExportCost(BaseModel, frozen=True, extra="ignore"):
 def read_cost(folder: Path) -> ExportCost:
     """Return what an export needs, from its folder. Raises UsageError: it is no export."""
     try:
-        return ExportCost.model_validate(parsed_json(read_bytes(held_file(folder, MANIFEST, ""), "", most=MOST_BYTES)))
-    except (UsageError, ValueError, ValidationError):
-        raise UsageError(f"{folder}: has no manifest of an export (coldloop export plc --out FOLDER)") from None
+        return ExportCost.model_validate(
+            text.parsed_json(text.read_bytes(text.held_file(folder, MANIFEST, ""), "", most=MOST_BYTES))
+        )
+    except (errors.UsageError, ValueError, ValidationError):
+        raise errors.UsageError(f"{folder}: has no manifest of an export (coldloop export plc --out FOLDER)") from None
 
 
 def cost_text(cost: ExportCost, profile: PlcProfile | None = None) -> str:
@@ -286,7 +288,7 @@ def profile_of(cost: ExportCost, total_us: float) -> str:
     Its name and memory are for the user to fill in. Raises UsageError: the export has no self-test of the solver.
     """
     if not cost.self_test:
-        raise UsageError("--took: this export has no self-test of the solver alone; name the folder above it")
+        raise errors.UsageError("--took: this export has no self-test of the solver alone; name the folder above it")
     nanoseconds = 1e3 * total_us / cost.self_test["operations"]
     return (
         'name = "our PLC"\n'

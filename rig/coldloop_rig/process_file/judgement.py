@@ -6,14 +6,10 @@ from typing import Final
 
 import numpy as np
 
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import LtiModel
-from coldloop.process.sections import Bath, Input, Output
+from coldloop.process import declaration, lti_model, sections
 from coldloop.text import ends_text, number_text
 from coldloop_rig.plc_sizing.holding import NOTHING, digits_last_s, leaves_its_band, shortest_period_s, waiting
-from coldloop_rig.process_file.linear_model import Array
-from coldloop_rig.process_file.making import Made
-from coldloop_rig.process_file.step_test import LEVEL, half_widths
+from coldloop_rig.process_file import linear_model, making, step_test
 
 ROUGH: Final = 1e-4  # error of the derivatives from which on the plant has a kink, or noise, at its operating point
 SMALL: Final = 1e-6  # singular value, over the largest, below which a direction counts as none
@@ -22,7 +18,7 @@ SHARE: Final = 0.01
 INVERSE: Final = 0.1  # inverse response, over the final change, from which on it is reported
 
 
-def described(made: Made) -> str:
+def described(made: making.Made) -> str:
     """Return the description of a process and its model; first come how late an update may be and a warning."""
     warnings, late = _warnings(made), []
     values = sorted(np.linalg.eigvals(made.own_A), key=lambda value: -value.real)
@@ -39,7 +35,9 @@ def described(made: Made) -> str:
     ])  # fmt: skip
 
 
-def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...], reach: Array | None = None) -> str:
+def _values(
+    names: tuple[str, ...], values: linear_model.Array, units: tuple[str, ...], reach: linear_model.Array | None = None
+) -> str:
     """Return values with their units, and half their intervals where these are known."""
     found = []
     for k, (name, value, unit) in enumerate(zip(names, values, units, strict=True)):
@@ -48,7 +46,7 @@ def _values(names: tuple[str, ...], values: Array, units: tuple[str, ...], reach
     return "  ".join(found)
 
 
-def _rest(made: Made) -> list[str]:
+def _rest(made: making.Made) -> list[str]:
     m, process = made.model, made.process
     load = f"; load {m.load_name} {number_text(m.w0, 5)} {m.load_unit}".rstrip() if m.F.any() or m.G.any() else ""
     problem = len(process.decision_instants) * (len(process.inputs) + 2 * len(process.bands))
@@ -63,7 +61,7 @@ def _rest(made: Made) -> list[str]:
     ]
 
 
-def _gains(made: Made) -> list[str]:
+def _gains(made: making.Made) -> list[str]:
     m = made.model
     horizon_s = made.process.horizon_s
     held = m.discretised(horizon_s)
@@ -71,12 +69,14 @@ def _gains(made: Made) -> list[str]:
     effects = np.column_stack([m.C @ held.B + m.D, m.C @ held.F + m.G, (m.C @ held.A)[:, n:]])
     names = (*m.input_names, m.load_name, *m.state_names[n:])
     units = (*m.input_units, m.load_unit, *m.state_units[n:])
-    reach: dict[str, Array] = {}  # half the intervals of what each input of a record does to the outputs
+    reach: dict[str, linear_model.Array] = {}  # half the intervals of what each input of a record does to the outputs
     lines = []
     if made.linear.record is not None:
         record, found = made.linear.record
-        reach = dict(zip(record.input_names, half_widths(record, found, horizon_s).T, strict=True))
-        lines = [f"gains      all within +- with a probability of {100 * LEVEL:g} %, by the noise of the record"]
+        reach = dict(zip(record.input_names, step_test.half_widths(record, found, horizon_s).T, strict=True))
+        lines = [
+            f"gains      all within +- with a probability of {100 * step_test.LEVEL:g} %, by the noise of the record"
+        ]
     return lines + [
         f"after {horizon_s:g} s of +1 {unit} {name}: ".replace("  ", " ")
         + _values(m.output_names, column, m.output_units, reach.get(name))
@@ -85,15 +85,15 @@ def _gains(made: Made) -> list[str]:
     ]
 
 
-def _rank_deficit(matrix: Array) -> int:
+def _rank_deficit(matrix: linear_model.Array) -> int:
     sizes = np.linalg.svd(matrix, compute_uv=False)
     return int((sizes < SMALL * max(sizes.max(), 1e-300)).sum()) if sizes.size else 0
 
 
-def _coarse(process: Process) -> list[str]:
+def _coarse(process: declaration.Process) -> list[str]:
     """Return what registers and on-line arithmetic, which have single precision, do not resolve."""
     bands = zip(process.banded, process.bands, strict=True)
-    resolved: list[tuple[Input | Output, tuple[float, float], float, str]] = [
+    resolved: list[tuple[sections.Input | sections.Output, tuple[float, float], float, str]] = [
         *((one, (one.low, one.high), SHARE * one.rate, "its rate") for one in process.inputs),
         *((one, one.range, one.noise, "the noise of its sensor") for one in process.outputs),
         *((one, one.range, SHARE * (band.high - band.low), "its band") for one, band in bands),
@@ -105,14 +105,14 @@ def _coarse(process: Process) -> list[str]:
     ]
 
 
-def unheld(banded: Sequence[Output], A: Array) -> str:
+def unheld(banded: Sequence[sections.Output], A: linear_model.Array) -> str:
     """Return that only MPC holds a plant (n, n) with an unstable mode and no loop on any output; else nothing."""
     if any(one.loop for one in banded) or np.linalg.eigvals(A).real.max() <= NOTHING:
         return ""
     return "nothing holds this plant when MPC has no answer: a mode grows, and no output has a loop"
 
 
-def _inverse_responses(made: Made) -> list[str]:
+def _inverse_responses(made: making.Made) -> list[str]:
     """Return which outputs with a band first move to the other side after a step of an input than where they end."""
     m, process, n, quarters = made.model, made.process, len(made.own_A), 4
     poles = np.linalg.eigvals(made.own_A)
@@ -142,7 +142,7 @@ def _inverse_responses(made: Made) -> list[str]:
     return found
 
 
-def _unstable(made: Made, growth: float) -> list[str]:
+def _unstable(made: making.Made, growth: float) -> list[str]:
     """Return how long a plant with a mode that grows can wait for an update, and what its horizon may be."""
     process, limits = made.process, np.array([[one.low, one.high, one.rate] for one in made.process.inputs]).T
     single, double = (digits_last_s(growth, real) for real in (np.float32, np.float64))
@@ -159,7 +159,7 @@ def _unstable(made: Made, growth: float) -> list[str]:
     return found
 
 
-def _exchanged(model: LtiModel, bath: Bath, horizon_s: float) -> list[str]:
+def _exchanged(model: lti_model.LtiModel, bath: sections.Bath, horizon_s: float) -> list[str]:
     """Return which outputs of a bath seem exchanged, in words."""
     values, modes = np.linalg.eig(model.A[np.ix_(model.moved, model.moved)])
     slowest = int(np.argmin(np.abs(values)))
@@ -172,7 +172,7 @@ def _exchanged(model: LtiModel, bath: Bath, horizon_s: float) -> list[str]:
     return []
 
 
-def _warnings(made: Made) -> list[str]:
+def _warnings(made: making.Made) -> list[str]:
     m, process, found = made.model, made.process, list[str]()
     sample_s, tick_s, lags = process.sampling_period_s, process.tick_s, made.linear.parameters.get("lags", ())
     poles = np.linalg.eigvals(made.own_A)

@@ -10,17 +10,14 @@ from typing import Any, Final
 import numpy as np
 
 from coldloop.errors import ModelFileError, UsageError
+from coldloop.process import lti_model, sections
 from coldloop.process.declaration import Process
-from coldloop.process.lti_model import LtiModel, discretise
-from coldloop.process.sections import Bath, Output, State
 from coldloop.text import file_digest
-from coldloop_plant.equilibrium import Linear, central_differences, model_of
+from coldloop_plant import equilibrium, own_plants
 from coldloop_plant.fmu import DOUBLE, Fmu, FmuSimulation, Wiring
-from coldloop_plant.own_plants import FMU, PYTHON
 from coldloop_rig.plc_sizing.operations import ProblemSizes, iteration_shares
-from coldloop_rig.process_file import linear_model, reading
+from coldloop_rig.process_file import linear_model, reading, step_test
 from coldloop_rig.process_file.linear_model import STEP, Array, Linearised, Record, operating_point
-from coldloop_rig.process_file.step_test import from_step_test, identified, model_identified, record_compared
 
 REGISTERS_OF_A_REQUEST: Final = 125
 """Registers of one Modbus read at most: the latched update, and the rack's measurement, are one read each."""
@@ -39,7 +36,7 @@ ALIKE: Final = (0.5, 2.0)  # gains of a record's model over those of the plant
 class Made:
     """Model and process that are made from a process file."""
 
-    model: LtiModel
+    model: lti_model.LtiModel
     process: Process
     linear: Linearised
     disturbances: int
@@ -58,7 +55,7 @@ def made_from(path: Path) -> Made:
     file = with_units(said, path.parent)
     linear = linearised(file, path.parent)
     sensors = (  # disturbances that are measured are the last outputs
-        Output(name=one.name, unit=one.unit, range=one.span, noise=one.noise)
+        sections.Output(name=one.name, unit=one.unit, range=one.span, noise=one.noise)
         for one in file.disturbances
         if one.noise is not None
     )
@@ -77,8 +74,8 @@ def made_from(path: Path) -> Made:
         "drawing": reading.drawing_of(path.parent / file.mimic, shown) if file.mimic else "",
     })  # fmt: skip
     _check_fits(process, linear)
-    matrices = Linear(linear.A, linear.B, linear.F[:, 0], linear.C, linear.D, linear.G[:, 0])
-    model = model_of(
+    matrices = equilibrium.Linear(linear.A, linear.B, linear.F[:, 0], linear.C, linear.D, linear.G[:, 0])
+    model = equilibrium.model_of(
         matrices, linear.x0, linear.u0, float(linear.w0[0]), linear.y0, process, linear.states, linear.digest,
         plant=linear.kind, note=f"made from {path.name}", process=process.model_dump(mode="json"),
         plant_parameters=linear.parameters | reading.courses_of(file, path.parent),
@@ -99,7 +96,7 @@ def linearised(file: Process, folder: Path) -> Linearised:
     elif plant.matrices is not None:
         found = linear_model.from_matrices(file, folder, plant.matrices)
     elif plant.step_test is not None:
-        found = from_step_test(file, folder / plant.step_test)
+        found = step_test.from_step_test(file, folder / plant.step_test)
     elif plant.fmu is not None:
         found = from_fmu(file, folder, plant.fmu)
     else:
@@ -118,13 +115,15 @@ def linearised(file: Process, folder: Path) -> Linearised:
 
 def _by_record(file: Process, plant: Linearised, path: Path) -> Linearised:
     """Return the model of a record, for a plant that hides its states; warn where gains after the horizon differ."""
-    model = from_step_test(file, path)
+    model = step_test.from_step_test(file, path)
     hidden = dict(plant.parameters)
-    if plant.kind == PYTHON:
+    if plant.kind == own_plants.PYTHON:
         hidden["rest"] = plant.x0.tolist()
-    elif plant.kind == FMU:
+    elif plant.kind == own_plants.FMU:
         hidden["wiring"] = {**hidden["wiring"], "states": ()}
-    true, found = (one.C @ discretise(one.A, one.B, one.F[:, 0], file.horizon_s).B + one.D for one in (plant, model))
+    true, found = (
+        one.C @ lti_model.discretise(one.A, one.B, one.F[:, 0], file.horizon_s).B + one.D for one in (plant, model)
+    )
     seen = np.abs(true) > SEEN * np.abs(true).max(axis=1, keepdims=True)
     warnings = [
         f"warning    gain: of {file.outputs[i].name} by {file.inputs[j].name} {found[i, j]:.3g}, of the plant itself "
@@ -132,7 +131,7 @@ def _by_record(file: Process, plant: Linearised, path: Path) -> Linearised:
         for i, j in np.argwhere(seen)
         if not ALIKE[0] <= found[i, j] / true[i, j] <= ALIKE[1]
     ]
-    notes = (*plant.notes, *model.notes, *warnings, *record_compared(file, path, plant, model))
+    notes = (*plant.notes, *model.notes, *warnings, *step_test.record_compared(file, path, plant, model))
     return model._replace(kind=plant.kind, parameters=hidden, digest=plant.digest, notes=notes)
 
 
@@ -157,7 +156,7 @@ def declaration_digest(file: Process, folder: Path) -> str:
     return hashlib.sha256(json.dumps([said, named], sort_keys=True).encode()).hexdigest()
 
 
-def _states(file: Process, linear: Linearised) -> tuple[State, ...]:
+def _states(file: Process, linear: Linearised) -> tuple[sections.State, ...]:
     given: dict[str, float | None] = {one.name: one.walk for one in file.disturbances}
     given |= {state.name: state.walk for state in file.states}
     unknown = set(given) - set(linear.states)
@@ -165,10 +164,10 @@ def _states(file: Process, linear: Linearised) -> tuple[State, ...]:
         raise UsageError(f"states: {min(unknown)} is no state of the plant: {', '.join(linear.states)}")
     sample_s = file.tick_s * file.ticks_per_sample
     steps = [(one.high - one.low) / 4 for one in file.inputs]
-    moves = np.abs(discretise(linear.A, linear.B, linear.F[:, 0], sample_s).B) @ steps
+    moves = np.abs(lti_model.discretise(linear.A, linear.B, linear.F[:, 0], sample_s).B) @ steps
     usual = USUAL_WALK * np.maximum(moves, 1e-6 * max(moves.max(), 1e-12))
     return tuple(
-        State(name=name, unit=unit, walk=given.get(name, float(walk)))
+        sections.State(name=name, unit=unit, walk=given.get(name, float(walk)))
         for (name, unit), walk in zip(linear.states.items(), usual, strict=True)
     )
 
@@ -221,7 +220,7 @@ def _check_fits(process: Process, linear: Linearised) -> None:
             )
 
 
-def _check_bath(file: Process, model: LtiModel, bath: Bath) -> None:
+def _check_bath(file: Process, model: lti_model.LtiModel, bath: sections.Bath) -> None:
     """Check that the laws of a bath have an answer (`UsageError`)."""
     for name in bath.states:
         if name not in model.state_names:
@@ -297,9 +296,9 @@ def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
         notes.append(f"warning    FMU: {error}; a step test of it makes the model instead")
         found, (simulation, wiring) = None, _at_rest(file, fmu, wiring)
     if found is None:
-        tested = identified(_step_tested(file, simulation, str(fmu.path)))
+        tested = step_test.identified(_step_tested(file, simulation, str(fmu.path)))
         wiring = replace(wiring, states=())
-        model = model_identified(file, tested, y, file.outside)
+        model = step_test.model_identified(file, tested, y, file.outside)
     else:
         u, w = operating_point(file)
         J, how = found
@@ -308,11 +307,13 @@ def from_fmu(file: Process, folder: Path, name: str) -> Linearised:
             names = [f"x{i}" for i in range(1, len(names) + 1)]
         units = (fmu.variables[state].unit or "" for state in wiring.states)
         states, how_made = dict(zip(names, units, strict=True)), (f"model      by {how} of the FMU",)
-        model = Linearised(*Linear.of(J, len(x), len(u)), x, u, w, y, states, FMU, {}, "", 0.0, how_made)
+        model = Linearised(
+            *equilibrium.Linear.of(J, len(x), len(u)), x, u, w, y, states, own_plants.FMU, {}, "", 0.0, how_made
+        )
     rest_s = wiring.rest_ticks * file.tick_s
     rest = f"rest       after {rest_s:g} s from the FMU's start, which each session begins with"
     parameters, notes = {"file": str(fmu.path.resolve()), "wiring": asdict(wiring)}, [rest, *model.notes, *notes]
-    return model._replace(kind=FMU, parameters=parameters, digest=file_digest(fmu.path), notes=tuple(notes))
+    return model._replace(kind=own_plants.FMU, parameters=parameters, digest=file_digest(fmu.path), notes=tuple(notes))
 
 
 def _wiring(file: Process, fmu: Fmu) -> Wiring:
@@ -408,7 +409,9 @@ def _differentiated(file: Process, fmu: Fmu, wiring: Wiring, simulation: FmuSimu
     spans = np.array([one.range[1] - one.range[0] for one in file.outputs])
     if not (np.abs(evaluated(at)[-len(outputs) :] - simulation.read(simulation.outputs)) <= 1e-3 * spans).all():
         return None  # its start values are not its states
-    return central_differences(evaluated, at, STEP * np.maximum(1.0, np.abs(at)))[0], "differences of start values"
+    return equilibrium.central_differences(evaluated, at, STEP * np.maximum(1.0, np.abs(at)))[
+        0
+    ], "differences of start values"
 
 
 def _step_tested(file: Process, simulation: FmuSimulation, where: str) -> Record:

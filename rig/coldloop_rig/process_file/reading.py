@@ -13,12 +13,10 @@ from pathlib import Path
 from typing import Any, Final
 from xml.etree import ElementTree as ET
 
-from coldloop.config import load_configuration
+from coldloop import config, table
 from coldloop.errors import ColdloopError, ConfigurationError, UsageError
 from coldloop.kernels.cache import find_cache_folder
-from coldloop.process.declaration import Process
-from coldloop.process.sections import Disturbance, Forecast, Load
-from coldloop.table import TIME, read_table
+from coldloop.process import declaration, sections
 from coldloop.text import read_bytes, read_text
 from coldloop_rig.interruption import SIGNALS
 
@@ -32,15 +30,17 @@ OWN: Final = ("plants", "shipped_mimic", "iterations", "forecasts", "drawing")
 """Keys of the cold box, and what is found with a model: no file of a user gives them."""
 
 
-def read_process_file(path: Path) -> Process:
+def read_process_file(path: Path) -> declaration.Process:
     """Return what a process file says. Raises ConfigurationError: one line that names file, key and remedy."""
-    file = load_configuration(Process, file=path, environment={}, option="FILE", listing=LISTING).settings
+    file = config.load_configuration(
+        declaration.Process, file=path, environment={}, option="FILE", listing=LISTING
+    ).settings
     if wrong := _wrong(file):
         raise ConfigurationError(f"{path}: {wrong}")
     return file
 
 
-def _wrong(file: Process) -> str:  # noqa: PLR0911 a return for each
+def _wrong(file: declaration.Process) -> str:  # noqa: PLR0911 a return for each
     """Return what is wrong with a process that is still without its model; empty where nothing is."""
     if own := [str(key) for key in OWN if key in file.model_fields_set]:
         return f"{own[0]}: is found with the model, or the cold box's own; leave it out"
@@ -96,7 +96,7 @@ def installed_source(name: str) -> tuple[str, str]:
         ) from error
 
 
-def courses_of(file: Process, folder: Path) -> dict[str, Any]:
+def courses_of(file: declaration.Process, folder: Path) -> dict[str, Any]:
     """Return what a model file says of the disturbances among the plant's parameters; nothing if there are none.
 
     Raises UsageError: a course cannot be read, or leaves the span: one line.
@@ -110,26 +110,26 @@ def courses_of(file: Process, folder: Path) -> dict[str, Any]:
     return {"disturbances": found}
 
 
-def forecasts_of(file: Process, folder: Path) -> tuple[Forecast, ...]:
+def forecasts_of(file: declaration.Process, folder: Path) -> tuple[sections.Forecast, ...]:
     """Return what the optimiser expects. Raises UsageError: a forecast cannot be read, or leaves the span: one line."""
     return tuple(
-        Forecast(name=one.name, ticks=tuple(ticks), values=tuple(values))
+        sections.Forecast(name=one.name, ticks=tuple(ticks), values=tuple(values))
         for one in file.outside
         if one.forecast is not None
         for ticks, values in [_steps(one, folder / one.forecast, file.tick_s)]
     )
 
 
-def _steps(one: Load | Disturbance, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
+def _steps(one: sections.Load | sections.Disturbance, path: Path, tick_s: float) -> tuple[list[int], list[float]]:
     """Return ticks and values of a CSV file with time_s and the name of a signal."""
-    wanted = (TIME, one.name)
-    times, values = read_table(path, wanted, "name a CSV file beside the process file").columns(wanted)
+    wanted = (table.TIME, one.name)
+    times, values = table.read_table(path, wanted, "name a CSV file beside the process file").columns(wanted)
     ticks = [round(time / tick_s) for time in times]
     if ticks[0] != 0:
-        raise UsageError(f"{path}: {TIME} begins at {times[0]:g}; it begins at 0, which is when a session begins")
+        raise UsageError(f"{path}: {table.TIME} begins at {times[0]:g}; it begins at 0, which is when a session begins")
     at = next((at for at, (before, tick) in zip(times[1:], pairwise(ticks), strict=True) if tick <= before), None)
     if at is not None:
-        raise UsageError(f"{path}: {TIME} = {at:g}: it rises by at least a tick, {tick_s:g} s, from line to line")
+        raise UsageError(f"{path}: {table.TIME} = {at:g}: it rises by at least a tick, {tick_s:g} s, from line to line")
     low, high = one.span
     wrong = next((value for value in values if not low <= value <= high), None)
     if wrong is not None:
@@ -189,13 +189,12 @@ def model_file_of(path: Path, *, in_child: bool = False) -> tuple[Path, list[str
         return path.resolve(), []
 
     def work() -> str:
-        from coldloop_rig.process_file.judgement import described  # noqa: PLC0415 a model file is read without
-        from coldloop_rig.process_file.making import made_from  # noqa: PLC0415
+        from coldloop_rig.process_file import judgement, making  # noqa: PLC0415 a model file is read without
 
-        made = made_from(path)
+        made = making.made_from(path)
         out = find_cache_folder("processes") / f"{path.stem}-{made.model.digest[:12]}.json"
         made.model.save(out)
-        return f"{out}\n{described(made)}"
+        return f"{out}\n{judgement.described(made)}"
 
     out, *lines = (text_of_child(path, work, limit_s=300) if in_child else work()).splitlines()
     return Path(out), [line for line in lines if line.startswith("warning")]

@@ -16,9 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import UsageError
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import discretise
-from coldloop.process.sections import Disturbance, Load
+from coldloop.process import declaration, lti_model, sections
 from coldloop.table import TIME, Table, read_table
 from coldloop_plant.own_plants import LINEAR
 from coldloop_rig.process_file.linear_model import Array, Identified, Linearised, Record, operating_point
@@ -92,7 +90,7 @@ def simulated(A: Array, B: Array, C: Array, D: Array, record: Record) -> Array:
     """
     n, m = B.shape
     u, scale = record.inputs - record.operating, np.maximum(record.outputs.std(axis=0), 1e-12)
-    at = discretise(A, B, np.zeros(n), record.period_s)
+    at = lti_model.discretise(A, B, np.zeros(n), record.period_s)
     responses, q = _responses(at.A, C, u, [np.arange(len(u))[piece] for piece in record.pieces]), n * len(record.pieces)
     left = record.outputs - responses[:, :, q : q + n * m] @ at.B.ravel() - u @ D.T
     free = np.delete(responses, np.s_[q : q + n * m], axis=2) / scale[:, np.newaxis]
@@ -204,7 +202,7 @@ WIDER: Final = 1.5
 
 def gains_after(found: Identified, horizon_s: float) -> Array:
     """Return what 1 of each input, held, does to the outputs after a horizon: shape (p, m)."""
-    return np.asarray(found.C @ discretise(found.A, found.B, np.zeros(len(found.A)), horizon_s).B)
+    return np.asarray(found.C @ lti_model.discretise(found.A, found.B, np.zeros(len(found.A)), horizon_s).B)
 
 
 def half_widths(record: Record, found: Identified, horizon_s: float) -> Array:
@@ -237,7 +235,7 @@ FAR: Final = 3.0  # least of that error over that of the model found in the reco
 EVEN: Final = 0.01  # largest deviation of an interval from the others, over their length
 
 
-def from_step_test(file: Process, path: Path) -> Linearised:
+def from_step_test(file: declaration.Process, path: Path) -> Linearised:
     """Return the model that a step test shows. Raises UsageError: one line that names file, line and remedy."""
     record, moved, table = _recorded(file, path)
     found = identified(record)
@@ -257,7 +255,7 @@ def from_step_test(file: Process, path: Path) -> Linearised:
     return model._replace(notes=(*model.notes, *notes), record=(record, found))
 
 
-def record_compared(file: Process, path: Path, plant: Linearised, model: Linearised) -> list[str]:
+def record_compared(file: declaration.Process, path: Path, plant: Linearised, model: Linearised) -> list[str]:
     """Return which outputs of a record the plant that it is for explains by far worse than the model found in it."""
     record, moved, _ = _recorded(file, path)
     places, deviations, unexplained = _places(file, moved), record.outputs.std(axis=0), []
@@ -273,7 +271,9 @@ def record_compared(file: Process, path: Path, plant: Linearised, model: Lineari
     ]
 
 
-def _recorded(file: Process, path: Path) -> tuple[Record, list[Load | Disturbance], Table]:
+def _recorded(
+    file: declaration.Process, path: Path
+) -> tuple[Record, list[sections.Load | sections.Disturbance], Table]:
     """Return a record in samples of the model, what moved in it beside the inputs, and the table that holds it."""
     named = (*file.inputs, *file.outside, *file.outputs)
     table = read_table(path, [TIME, *(one.name for one in named)], "name a CSV file beside the process file")
@@ -303,12 +303,14 @@ def _recorded(file: Process, path: Path) -> tuple[Record, list[Load | Disturbanc
     return Record(period_s * every, held, outputs[::every], at, tuple(names), table.where, cut), moved, table
 
 
-def _places(file: Process, moved: Sequence[Load | Disturbance]) -> list[int]:
+def _places(file: declaration.Process, moved: Sequence[sections.Load | sections.Disturbance]) -> list[int]:
     """Return the columns that load and disturbances have in F and G."""
-    return [1 + file.disturbances.index(one) if isinstance(one, Disturbance) else 0 for one in moved]
+    return [1 + file.disturbances.index(one) if isinstance(one, sections.Disturbance) else 0 for one in moved]
 
 
-def model_identified(file: Process, found: Identified, y0: Array, moved: Sequence[Load | Disturbance]) -> Linearised:
+def model_identified(
+    file: declaration.Process, found: Identified, y0: Array, moved: Sequence[sections.Load | sections.Disturbance]
+) -> Linearised:
     """Return what was identified, of inputs and of what moved beside them, as a process that rests at `y0`."""
     u, w = operating_point(file)
     n, m, p = len(found.A), len(u), len(y0)

@@ -9,8 +9,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import ArrayLike, NDArray
 
-from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 from coldloop.registers import Maps, common, control_plc, maps_of, optimizer_plc, plant
 
 FORMAT: Final = 2
@@ -51,13 +50,13 @@ class RunFile(NamedTuple):
 
 
 @cache
-def files_of(process: Process) -> dict[str, RunFile]:
+def files_of(process: declaration.Process) -> dict[str, RunFile]:
     """Return the files of a run of a process, by name."""
     maps = maps_of(process)
     updates = "One row an update that no load step cut off; `verdict` says whether it was played"
     station = "One row a tick: compression station and nitrogen; only where the plant is a refrigerator"
     sample = maps.plant.block_of(plant.StationSample).fields
-    signals = zip(STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, strict=True)
+    signals = zip(cold_box.STATION_SIGNAL_NAMES, cold_box.STATION_SIGNAL_UNITS, strict=True)
     station_columns = (
         *_when(process),
         *(Column(name, REAL, unit, sample["signals"].description) for name, unit in signals),
@@ -86,7 +85,7 @@ def files_of(process: Process) -> dict[str, RunFile]:
     }
 
 
-def _when(process: Process) -> tuple[Column, Column]:
+def _when(process: declaration.Process) -> tuple[Column, Column]:
     return (
         Column("tick", LONG, "1", f"Tick since the start of the session, of {process.tick_unit}"),
         Column("time_s", pa.float64(), "s", "Plant time since the start of the session"),
@@ -104,7 +103,7 @@ _DRIVING: Final = (
 """Columns of the control PLC's operating state, from its events, and of the stage cost."""
 
 
-def _trace(process: Process, maps: Maps) -> tuple[Column, ...]:
+def _trace(process: declaration.Process, maps: Maps) -> tuple[Column, ...]:
     """Return load, inputs, outputs and states in the order of the digest; what sensors showed; mode and update."""
     load = maps.plant.block_of(plant.PlantSample).fields["load"].description
     update = maps.optimizer_plc.block_of(optimizer_plc.Optimization).fields
@@ -127,7 +126,7 @@ def _trace(process: Process, maps: Maps) -> tuple[Column, ...]:
     )
 
 
-def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
+def _updates(process: declaration.Process, maps: Maps) -> tuple[Column, ...]:
     tick, time = _when(process)
     return (
         Column("update", LONG, "1", "Number of the update"),
@@ -143,7 +142,7 @@ def _updates(process: Process, maps: Maps) -> tuple[Column, ...]:
     )  # fmt: skip
 
 
-def schema_document(process: Process, *, station: bool = False) -> dict[str, Any]:
+def schema_document(process: declaration.Process, *, station: bool = False) -> dict[str, Any]:
     """Return the content of `schema.json`; with the station's file where there is one."""
 
     def described(one: Column) -> dict[str, Any]:
@@ -160,7 +159,7 @@ def schema_document(process: Process, *, station: bool = False) -> dict[str, Any
     }
 
 
-def excess_keys(process: Process) -> list[str]:
+def excess_keys(process: declaration.Process) -> list[str]:
     """Return the names of what is known of the excess of each output with a band.
 
     They are the share of the known ticks in which it was beyond by more than its dead band, %; the largest excess over

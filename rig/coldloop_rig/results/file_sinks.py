@@ -21,12 +21,8 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from coldloop.errors import ResultsError, UsageError
-from coldloop.process.cold_box import recorded_model_range
-from coldloop.process.declaration import Process
-from coldloop.registers.common import Event, EventKind
-from coldloop.registers.control_plc import Cause, Mode
-from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import SensorFaultKind
+from coldloop.process import cold_box, declaration
+from coldloop.registers import common, control_plc, optimizer_plc, plant
 from coldloop.service.journal import describe, utc_text
 from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, RunFile, files_of, number_array, text_array
 from coldloop_rig.results.recording import PLANT, SampleBlock, Sink, StageCost, joined
@@ -102,7 +98,7 @@ class _FileSink(Sink, Generic[T]):
     name: ClassVar[str]
     enough: ClassVar[int] = GROUP_ROWS
 
-    def __init__(self, folder: Path, reserve: DiskReserve, process: Process) -> None:
+    def __init__(self, folder: Path, reserve: DiskReserve, process: declaration.Process) -> None:
         self._file = ReservedFile(folder / self.name, reserve)
         self._folder, self._reserve, self._process = folder, reserve, process
         self._taken: list[T] = []
@@ -154,13 +150,13 @@ class TraceSink(_FileSink[SampleBlock]):
         super().__init__(folder, reserve, cost.process)
         self._cost = cost
         self._driving = DrivingHistory(cost.process)
-        self._updates: deque[Optimization] = deque()
+        self._updates: deque[optimizer_plc.Optimization] = deque()
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         """Take an update, which the ticks from its own on refer to."""
         self._updates.append(update)
 
-    def event(self, service: str, event: Event) -> None:
+    def event(self, service: str, event: common.Event) -> None:
         """Take an event, which the ticks from its own on refer to."""
         self._driving.event(service, event)
 
@@ -198,38 +194,38 @@ class StationSink(_FileSink[SampleBlock]):
         return station_table(joined(parts), self._process)
 
 
-class UpdatesSink(_FileSink[Optimization]):
+class UpdatesSink(_FileSink[optimizer_plc.Optimization]):
     """Writes `updates.parquet`."""
 
     name = UPDATES
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         """Take an update."""
         self._take(update)
 
-    def _table(self, parts: list[Optimization]) -> pa.Table:
+    def _table(self, parts: list[optimizer_plc.Optimization]) -> pa.Table:
         return updates_table(parts, self._process)
 
 
-class EventsSink(_FileSink[tuple[str, Event]]):
+class EventsSink(_FileSink[tuple[str, common.Event]]):
     """Writes `events.parquet`."""
 
     name = EVENTS
 
-    def event(self, service: str, event: Event) -> None:
+    def event(self, service: str, event: common.Event) -> None:
         """Take an event."""
         self._take((service, event))
 
-    def _table(self, parts: list[tuple[str, Event]]) -> pa.Table:
+    def _table(self, parts: list[tuple[str, common.Event]]) -> pa.Table:
         return events_table(parts, self._process)
 
 
 DRIVERS: Final[Mapping[int, str]] = {
-    Mode.MPC: "optimizer",
-    Mode.REST: "optimizer",
-    Mode.HOLD: "nobody",
-    Mode.CLASSICAL: "loops",
-    Mode.MANUAL: "operator",
+    control_plc.Mode.MPC: "optimizer",
+    control_plc.Mode.REST: "optimizer",
+    control_plc.Mode.HOLD: "nobody",
+    control_plc.Mode.CLASSICAL: "loops",
+    control_plc.Mode.MANUAL: "operator",
 }
 """Source of the applied inputs in each mode; "nobody" while the last ones are held."""
 
@@ -239,7 +235,7 @@ class Driving(NamedTuple):
 
     tick: int = 0
     mode: int | None = None
-    cause: int = Cause.NONE
+    cause: int = control_plc.Cause.NONE
     bad: frozenset[int] = frozenset()
     """Outputs whose measurement was substituted."""
 
@@ -250,25 +246,25 @@ class DrivingHistory:
     A restarted control PLC may resume some ticks back: its later events hold from there on.
     """
 
-    def __init__(self, process: Process) -> None:
+    def __init__(self, process: declaration.Process) -> None:
         self.process = process
         self._states = [Driving()]
-        self._faults: dict[int, list[Event]] = {output: [] for output in process.controlled}
+        self._faults: dict[int, list[common.Event]] = {output: [] for output in process.controlled}
         self._held = dict.fromkeys(process.controlled, math.nan)
         """Values that frozen sensors show, by output."""
 
-    def event(self, service: str, event: Event) -> None:
+    def event(self, service: str, event: common.Event) -> None:
         """Take an event."""
         if service == PLANT:
-            if event.kind == EventKind.SESSION:  # it begins with healthy sensors
+            if event.kind == common.EventKind.SESSION:  # it begins with healthy sensors
                 self._faults = {output: [] for output in self._faults}
-            elif event.kind == EventKind.SENSOR_FAULT and event.subject in self._faults:
+            elif event.kind == common.EventKind.SENSOR_FAULT and event.subject in self._faults:
                 self._faults[event.subject].append(event)
             return
         last = self._states[-1]
-        if event.kind == EventKind.MODE:
+        if event.kind == common.EventKind.MODE:
             self._change(last._replace(tick=event.tick, mode=event.subject, cause=event.cause))
-        elif event.kind == EventKind.SENSOR and event.subject < len(self.process.outputs):
+        elif event.kind == common.EventKind.SENSOR and event.subject < len(self.process.outputs):
             bad = last.bad | {event.subject} if event.cause else last.bad - {event.subject}
             self._change(last._replace(tick=event.tick, bad=bad))
 
@@ -284,7 +280,11 @@ class DrivingHistory:
         texts: list[tuple[str | None, ...]] = []
         for _, mode, cause, outputs in self._states:
             bad = " ".join(self.process.output_names[output] for output in sorted(outputs))
-            words = (None,) * 3 if mode is None else (Mode.word_of(mode), Cause.word_of(cause), DRIVERS.get(mode))
+            words = (
+                (None,) * 3
+                if mode is None
+                else (control_plc.Mode.word_of(mode), control_plc.Cause.word_of(cause), DRIVERS.get(mode))
+            )
             texts.append((*words, bad))
         return [text_array(each, places) for each in zip(*texts, strict=True)]
 
@@ -296,7 +296,7 @@ class DrivingHistory:
             values, before = y[:, output].copy(), None
             for fault, until in zip(faults, [*(later.tick for later in faults[1:]), end], strict=False):
                 begin, stop = np.clip([fault.tick - first, until - first], 0, len(values))
-                if fault.cause == SensorFaultKind.FROZEN and first <= fault.tick < end:
+                if fault.cause == plant.SensorFaultKind.FROZEN and first <= fault.tick < end:
                     # the value shown then: the output itself, or that of the previous fault
                     self._held[output] = _shown_by(before, values[fault.tick - first], self._held[output])
                 if fault.cause and begin < stop:
@@ -313,21 +313,23 @@ class DrivingHistory:
             del faults[: max(0, bisect_right([fault.tick for fault in faults], tick) - 1)]
 
 
-def _shown_by(fault: Event | None, true: float, held: float) -> float:
+def _shown_by(fault: common.Event | None, true: float, held: float) -> float:
     """Return what a sensor shows by the event of its last fault."""
-    if fault is None or fault.cause == SensorFaultKind.NONE:
+    if fault is None or fault.cause == plant.SensorFaultKind.NONE:
         return float(true)
-    if fault.cause == SensorFaultKind.NOT_A_NUMBER:
+    if fault.cause == plant.SensorFaultKind.NOT_A_NUMBER:
         return math.nan
-    return held if fault.cause == SensorFaultKind.FROZEN else fault.value
+    return held if fault.cause == plant.SensorFaultKind.FROZEN else fault.value
 
 
 def trace_table(
-    block: SampleBlock, updates: Sequence[Optimization], cost: StageCost, driving: DrivingHistory
+    block: SampleBlock, updates: Sequence[optimizer_plc.Optimization], cost: StageCost, driving: DrivingHistory
 ) -> pa.Table:
     """Return the trace of a block; `updates` are those played, from the last before it on; `driving` has the events."""
     ticks, process = block.first + np.arange(len(block.load)), driving.process
-    outside: Any = recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
+    outside: Any = (
+        cold_box.recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
+    )
     columns = [
         ticks, ticks * process.tick_s, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),
         cost.of(block), *_held(ticks, updates, process.tick_s), (outside, np.isnan(block.load)),
@@ -335,7 +337,7 @@ def trace_table(
     return _of_arrays(columns, files_of(process)[TRACE])
 
 
-def station_table(block: SampleBlock, process: Process) -> pa.Table:
+def station_table(block: SampleBlock, process: declaration.Process) -> pa.Table:
     """Return what is known of the station at the ticks of a block that has one."""
     ticks = block.first + np.arange(len(block.load))
     unknown = np.isnan(block.station[:, 0])
@@ -355,7 +357,7 @@ def _of_arrays(columns: Sequence[Any], file: RunFile) -> pa.Table:
     return pa.table(arrays, schema)
 
 
-def _held(ticks: Any, updates: Sequence[Optimization], tick_s: float) -> list[Any]:  # noqa: ANN401 an array of integers
+def _held(ticks: Any, updates: Sequence[optimizer_plc.Optimization], tick_s: float) -> list[Any]:  # noqa: ANN401 an array of integers
     """Return the columns that change at updating instants only, with a mask of the ticks before the first.
 
     The time of an update that a load step has cut off belongs to the one before.
@@ -366,14 +368,14 @@ def _held(ticks: Any, updates: Sequence[Optimization], tick_s: float) -> list[An
     return [(np.asarray(column)[np.maximum(latest, 0)], none) for column in zip(*rows, strict=True)]
 
 
-def updates_table(updates: Sequence[Optimization], process: Process) -> pa.Table:
+def updates_table(updates: Sequence[optimizer_plc.Optimization], process: declaration.Process) -> pa.Table:
     """Return the table of updates."""
     tick_s = process.tick_s
     rows = [{**row._asdict(), "time_s": row.tick * tick_s, "tau_u_s": row.tau_u * tick_s} for row in updates]
     return _of_rows(rows, files_of(process)[UPDATES])
 
 
-def events_table(events: Sequence[tuple[str, Event]], process: Process) -> pa.Table:
+def events_table(events: Sequence[tuple[str, common.Event]], process: declaration.Process) -> pa.Table:
     """Return the table of events."""
     rows = [
         {

@@ -18,10 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from coldloop.errors import ColdloopError, LinkError
-from coldloop.process.cold_box import STATION_SIGNAL_NAMES
-from coldloop.process.lti_model import LtiModel
-from coldloop.registers import common, optimizer_plc, plant
-from coldloop.registers.control_plc import Verdict
+from coldloop.process import cold_box, lti_model
+from coldloop.registers import common, control_plc, optimizer_plc, plant
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_optimizer_plc.qp.prediction import state_weights
 from coldloop_optimizer_plc.settings import ControlDesign
@@ -47,7 +45,7 @@ PLANT: Final = "plant"
 """Services that have a journal."""
 
 NO_STATION: FloatArray = np.empty((0, 0), np.float32)
-STATION_COLUMNS = len(STATION_SIGNAL_NAMES) + 2
+STATION_COLUMNS = len(cold_box.STATION_SIGNAL_NAMES) + 2
 
 
 class LinkStatistics(NamedTuple):
@@ -433,7 +431,7 @@ def excess_of(y: NDArray[Any], design: ControlDesign) -> NDArray[np.float64]:
 class StageCost:
     """The stage cost of what was really reached: deviations from the operating point, and violations of the bands."""
 
-    def __init__(self, model: LtiModel, design: ControlDesign) -> None:
+    def __init__(self, model: lti_model.LtiModel, design: ControlDesign) -> None:
         self.process = design.process
         n = len(self.process.states)  # a model of the whole refrigerator has further ones, which weigh nothing
         self._x0, self._u0, self._y0 = model.x0[:n], model.u0, model.y0
@@ -459,13 +457,15 @@ class StageCost:
 
 def has_no_answer(update: Optimization) -> bool:
     """Return whether an update had no answer; in real time it may have been rejected for another reason first."""
-    return update.verdict == Verdict.NO_ANSWER or not math.isfinite(update.j_dev + update.j_cst + update.violation)
+    return update.verdict == control_plc.Verdict.NO_ANSWER or not math.isfinite(
+        update.j_dev + update.j_cst + update.violation
+    )
 
 
 class RunEvaluation(Sink):
     """Sums the indicators of a run, and its digest, in constant memory; ticks that are unknown add nothing."""
 
-    def __init__(self, model: LtiModel, design: ControlDesign) -> None:
+    def __init__(self, model: lti_model.LtiModel, design: ControlDesign) -> None:
         self._cost = StageCost(model, design)
         self.process, self._design = design.process, design
         self._digest = hashlib.sha256()
@@ -540,7 +540,7 @@ class RunEvaluation(Sink):
         )
 
 
-def evaluate(recording: Recording, model: LtiModel, design: ControlDesign) -> Indicators:
+def evaluate(recording: Recording, model: lti_model.LtiModel, design: ControlDesign) -> Indicators:
     """Return the indicators of a recording, as `RunEvaluation` would have summed them."""
     evaluation = RunEvaluation(model, design)
     rest = recording.block

@@ -24,9 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from coldloop.errors import ResultsError, UsageError, printable
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import process_in, read_document
-from coldloop.process.updating_periods import LONGEST_TICKS
+from coldloop.process import declaration, lti_model, updating_periods
 from coldloop.registers.control_plc import Mode
 from coldloop.text import held_file, parsed_json, read_text, whole_file, whole_text
 from coldloop_rig.results.columns import EVENTS, FILES, FORMAT, STATION, TRACE, files_of, numbers_of
@@ -150,7 +148,7 @@ MOST_IN_MEMORY: Final = 2_000_000
 """Rows of a file that is read as a whole: 139 h of ticks."""
 MOST_LISTED: Final = 500_000
 """Rows of a file of which each becomes an object of Python: events and updates."""
-Ticks = Annotated[int, Field(ge=0, le=LONGEST_TICKS)]
+Ticks = Annotated[int, Field(ge=0, le=updating_periods.LONGEST_TICKS)]
 
 
 class _Part(BaseModel, extra="allow", strict=True):
@@ -249,7 +247,7 @@ class RunFolder:
             return configured
         return {key: value for key, value in configured.items() if key not in GONE}
 
-    def file(self, name: str, most: int = LONGEST_TICKS) -> pq.ParquetFile:
+    def file(self, name: str, most: int = updating_periods.LONGEST_TICKS) -> pq.ParquetFile:
         """Return a Parquet file of the run, of `most` rows at most, after a look at its footer and at its texts.
 
         Raises UsageError: it cannot be read, or is larger than a run of so many ticks makes it, or has other types.
@@ -284,19 +282,21 @@ class RunFolder:
         return ""
 
     @cached_property
-    def process(self) -> Process:
+    def process(self) -> declaration.Process:
         """The process that was run. Raises UsageError: its declaration is none that this version makes."""
         place = f"{self.path / str(self.manifest['inputs']['model']['file'])}: process"
-        return process_in(self.model.get("process", {}), place, "use the version of Coldloop that made this run")
+        return lti_model.process_in(
+            self.model.get("process", {}), place, "use the version of Coldloop that made this run"
+        )
 
     @property
     def model(self) -> dict[str, Any]:
         """The copy of its model file; empty where there is none, as of the cold box that is shipped."""
         place: str | None = self.manifest["inputs"]["model"]["file"]
-        return read_document(self.held(place), "restore it") if place else {}
+        return lti_model.read_document(self.held(place), "restore it") if place else {}
 
     @contextmanager
-    def reading(self, name: str, most: int = LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
+    def reading(self, name: str, most: int = updating_periods.LONGEST_TICKS) -> Iterator[pq.ParquetFile]:
         """Open a Parquet file of the run. Raises UsageError, in a line: it cannot be read, or has other columns."""
         try:
             with self.file(name, most) as file:
@@ -392,7 +392,7 @@ ABOUT: Final = ("complete", "started_utc", "coldloop", "way")
 """Keys of the manifest that a MATLAB or HDF5 file has, too."""
 
 
-def _tables(run: RunFolder, most: int = LONGEST_TICKS) -> dict[str, pq.ParquetFile]:
+def _tables(run: RunFolder, most: int = updating_periods.LONGEST_TICKS) -> dict[str, pq.ParquetFile]:
     present = [name for name in FILES if name != STATION or (run.path / name).exists()]
     return {name.removesuffix(".parquet"): run.file(name, most) for name in present}
 

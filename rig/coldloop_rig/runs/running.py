@@ -21,16 +21,12 @@ from typing import Any, Final
 
 import numpy as np
 
-from coldloop import __version__
-from coldloop.config import Configuration, load_configuration
+from coldloop import __version__, config, text
 from coldloop.errors import ColdloopError, ResultsError, UsageError, printable
-from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import load as load_model
-from coldloop.process.lti_model import read_document
+from coldloop.process import load_profile, lti_model
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.plant import PlantSample
 from coldloop.session import TimeMode
-from coldloop.text import file_digest, held_file, read_bytes
 from coldloop_optimizer_plc.computing_settings import PlcBudget
 from coldloop_optimizer_plc.qp.linear_algebra import real_of
 from coldloop_optimizer_plc.settings import AdaptiveSettings, ProgramSettings, RuleName
@@ -49,7 +45,7 @@ REFRIGERATOR_COPY: Final = f"{INPUTS}/refrigerator.json"
 RESTORE: Final = "the run cannot be repeated without it"
 
 
-def _copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict[str, Any]:
+def _copy_inputs(settings: Settings, profile: load_profile.LoadProfile, folder: Path) -> dict[str, Any]:
     """Copy the files that a run reads into its folder; return their description for the manifest.
 
     A load that has a name is described by the digest of its steps, the model that is shipped by its own digest.
@@ -58,13 +54,13 @@ def _copy_inputs(settings: Settings, profile: LoadProfile, folder: Path) -> dict
     name, model_file = settings.plant.load, settings.model.file
 
     def copied(source: Path, copy: str) -> dict[str, str]:
-        content = read_bytes(source, RESTORE)
+        content = text.read_bytes(source, RESTORE)
         (folder / copy).write_bytes(content)
         return {"source": str(source), "file": copy, "sha256": hashlib.sha256(content).hexdigest()}
 
     load: dict[str, Any] = {"source": name, "file": None, "profile_sha256": json_digest([profile.times, profile.watts])}
     if with_copied_load(settings, profile, folder) is not settings:
-        load |= {"file": LOAD_COPY, "sha256": file_digest(folder / LOAD_COPY, RESTORE)}
+        load |= {"file": LOAD_COPY, "sha256": text.file_digest(folder / LOAD_COPY, RESTORE)}
     model = copied(model_file, MODEL_COPY)
     if model_file == SHIPPED_MODELS["cold-box"]:
         model["source"] = "shipped"
@@ -84,7 +80,7 @@ def _changed_inputs(manifest: dict[str, Any], folder: Path) -> list[str]:
         for name, entry in manifest["inputs"].items()
         if entry
         and entry["file"] is not None
-        and file_digest(held_file(folder, entry["file"], RESTORE), RESTORE) != entry.get("sha256")
+        and text.file_digest(text.held_file(folder, entry["file"], RESTORE), RESTORE) != entry.get("sha256")
     ]
     if json_digest(manifest["configuration"]) != manifest["hashes"]["configuration_sha256"]:
         changed.append(f"{folder / 'manifest.json'}: the configuration is not the one that the run had")
@@ -101,10 +97,14 @@ def _now_utc() -> str:
 
 
 def _first_manifest(
-    effective: Configuration[Settings], ticks: int, inputs: Mapping[str, Any], way: str, arguments: Mapping[str, Any]
+    effective: config.Configuration[Settings],
+    ticks: int,
+    inputs: Mapping[str, Any],
+    way: str,
+    arguments: Mapping[str, Any],
 ) -> dict[str, Any]:
     configured = {key: value for key, value, _ in effective.effective() if value is not None}  # None is "not set"
-    model = load_model(effective.settings.model.file)
+    model = lti_model.load(effective.settings.model.file)
     return {
         "format": columns.FORMAT, "complete": False, "reason": "the run has not ended, or its process was killed",
         "started_utc": _now_utc(), "ended_utc": None,
@@ -140,14 +140,14 @@ class RunFiles:
     """
 
     def __init__(
-        self, folder: Path, effective: Configuration[Settings], scenario: Scenario, way: str,
+        self, folder: Path, effective: config.Configuration[Settings], scenario: Scenario, way: str,
         arguments: Mapping[str, Any], sinks: Sequence[recording.Sink],
     ) -> None:  # fmt: skip
         settings = effective.settings
         for file in (settings.model.file, Path(settings.plant.load)):
             if file.is_file() and file.resolve().is_relative_to((folder / INPUTS).resolve()):
                 raise UsageError(f"{file}: the run replaces what is in {folder}; name another --out")
-        model, design = load_model(settings.model.file), settings.optimizer_plc.program.design
+        model, design = lti_model.load(settings.model.file), settings.optimizer_plc.program.design
         process, self.folder = settings.process, folder
         self._evaluation = recording.RunEvaluation(model, design)
         self._discard()
@@ -247,7 +247,7 @@ class _FirstTick(recording.Sink):
 def make_scenario(settings: Settings, ticks: int | None = None) -> Scenario:
     """Return the scenario of a configuration; without a length it is that of the load."""
     name = settings.plant.load
-    load = find_load(name, load_model(settings.model.file).w0, settings.process)
+    load = find_load(name, lti_model.load(settings.model.file).w0, settings.process)
     period_s, session = settings.optimizer_plc.program.updating_period_s, settings.session
     realtime = session.mode is TimeMode.REALTIME
     return Scenario(ticks or natural_ticks(name, load), load, period_s, settings.plant.seed, realtime, session.factor)
@@ -317,7 +317,7 @@ def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None)
     if changed := _changed_inputs(manifest, folder):
         raise UsageError("; ".join(changed))
     if trusted is not None:
-        own, ours = run.model, read_document(trusted)
+        own, ours = run.model, lti_model.read_document(trusted)
         if (own.get("process") or ours.get("process")) and own.get("digest") != ours["digest"]:
             remedy = "leave out --process"
             if own.get("process"):
@@ -333,7 +333,7 @@ def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None)
     return False, _differences(manifest, run, trace)
 
 
-def _recorded_configuration(run: run_folder.RunFolder) -> Configuration[Settings]:
+def _recorded_configuration(run: run_folder.RunFolder) -> config.Configuration[Settings]:
     values = dict(run.configuration)
     copies = {"plant.load": "load", "model.file": "model", "plant.refrigerator.file": "refrigerator"}
     for key, entry in copies.items():
@@ -345,10 +345,12 @@ def _recorded_configuration(run: run_folder.RunFolder) -> Configuration[Settings
         elif key in values and named_families(str(values[key])) is None:
             raise UsageError(f"{run.path / 'manifest.json'}: {key}: the folder has no copy of it")
     options = {key: (value, "manifest") for key, value in values.items()}
-    return load_configuration(Settings, environment={}, options=options)
+    return config.load_configuration(Settings, environment={}, options=options)
 
 
-def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool) -> str:
+def _repeated_trace(
+    effective: config.Configuration[Settings], scenario: Scenario, out: Path | None, *, force: bool
+) -> str:
     from coldloop_rig.progress import RunProgress  # noqa: PLC0415 a run without a bar starts sooner
 
     process = effective.settings.process
@@ -358,7 +360,7 @@ def _repeated_trace(effective: Configuration[Settings], scenario: Scenario, out:
             summary = run_into(out, Job(effective, scenario, recording.Way.IN_PROCESS), {}, figure, [progress])
             return str(summary["trace_sha256"])
         settings = effective.settings
-        evaluation = recording.RunEvaluation(load_model(settings.model.file), settings.optimizer_plc.program.design)
+        evaluation = recording.RunEvaluation(lti_model.load(settings.model.file), settings.optimizer_plc.program.design)
         recorder = recording.Recorder(scenario.ticks, [evaluation, progress])
         OneProcessRig(settings).run(scenario, recorder)
         recorder.close()
@@ -382,7 +384,7 @@ def _differences(manifest: Mapping[str, Any], run: run_folder.RunFolder, trace: 
 PERIOD = "optimizer_plc.program.updating_period_s"
 
 
-def remarks(effective: Configuration[Settings]) -> list[str]:
+def remarks(effective: config.Configuration[Settings]) -> list[str]:
     """Return remarks for a user before a run, a line each. Raises UsageError: in real time no answer is in time."""
     program, realtime = effective.settings.optimizer_plc.program, effective.settings.session.mode is TimeMode.REALTIME
     process, (budget, _) = effective.settings.process, _budget(program)
@@ -423,7 +425,7 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
     """
     limits, program, process, more = settings.limits, settings.optimizer_plc.program, settings.process, ""
     reach, (budget, shortest_s) = np.array([limits.low, limits.high, limits.rate]), _budget(program)
-    needs = waiting(load_model(settings.model.file), process, reach, limits.rate_share)
+    needs = waiting(lti_model.load(settings.model.file), process, reach, limits.rate_share)
     fixed_s = program.updating_period_s
     rule = "adaptive.contraction" if program.adaptive.rule is RuleName.CONTRACTION else "adaptive"
     most = program.adaptive.contraction.q_max if rule == "adaptive.contraction" else program.adaptive.q_max
@@ -442,7 +444,7 @@ def certificate(settings: Settings, *, only_lost: bool = False) -> str:
     return f"a mode of the plant grows with {needs.growth:.3g} /s: {needs.text(period_s, whose)}{more}"
 
 
-def enforced(effective: Configuration[Settings]) -> Configuration[Settings]:
+def enforced(effective: config.Configuration[Settings]) -> config.Configuration[Settings]:
     """Return a configuration whose fixed updating period is as long as the PLC takes; an adaptive one always is.
 
     Raises UsageError: the longest updating period is too short for the PLC, or the shortest too long for the plant.

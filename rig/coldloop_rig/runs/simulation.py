@@ -19,16 +19,14 @@ from typing import Any
 import pyarrow as pa
 from matplotlib.figure import Figure
 
-from coldloop import __version__
+from coldloop import __version__, errors
 from coldloop.config import Configuration
-from coldloop.errors import UsageError
 from coldloop.process import declaration, lti_model, updating_periods
 from coldloop.registers.common import Event
 from coldloop_rig.cosim.one_process import OneProcessRig
 from coldloop_rig.figures import plot
-from coldloop_rig.results.file_sinks import DrivingHistory, events_table, station_table, trace_table, updates_table
+from coldloop_rig.results import file_sinks, run_folder
 from coldloop_rig.results.recording import MemorySink, Recorder, Recording, RunEvaluation, StageCost
-from coldloop_rig.results.run_folder import batch_series, units_of
 from coldloop_rig.runs.running import certificate, enforced, make_scenario, summary_of, too_slow
 from coldloop_rig.settings import Period, Settings, configured
 
@@ -45,7 +43,7 @@ class Table:
     @property
     def units(self) -> dict[str, str]:
         """The unit of each column."""
-        return units_of(self.arrow.schema)
+        return run_folder.units_of(self.arrow.schema)
 
     def to_pandas(self) -> Any:  # noqa: ANN401 pandas is not a dependency
         """Return the table as a DataFrame, with the units in `attrs["units"]`; needs pandas."""
@@ -85,29 +83,29 @@ class Simulation:
     @cached_property
     def trace(self) -> Table:
         """One row a tick."""
-        history = DrivingHistory(self.process)
+        history = file_sinks.DrivingHistory(self.process)
         for service, event in self._events:
             history.event(service, event)
-        return Table(trace_table(self.recording.block, self.recording.updates, self._cost, history))
+        return Table(file_sinks.trace_table(self.recording.block, self.recording.updates, self._cost, history))
 
     @cached_property
     def updates(self) -> Table:
         """One row an update whose sequence was played."""
-        return Table(updates_table(self.recording.updates, self.process))
+        return Table(file_sinks.updates_table(self.recording.updates, self.process))
 
     @cached_property
     def events(self) -> Table:
         """One row a change of mode or of an alarm."""
-        return Table(events_table(self._events, self.process))
+        return Table(file_sinks.events_table(self._events, self.process))
 
     def plot(self, path: str | Path | None = None) -> Figure:
         """Return the figure of the run; with a path it is written there too, as .png, .pdf or .svg."""
         (batch,) = self.trace.arrow.select(["time_s", *plot.labels_of(self.process)]).to_batches()
-        series, block = batch_series(batch), self.recording.block
+        series, block = run_folder.batch_series(batch), self.recording.block
         pressures = plot.pressure_limits(self.configuration) if block.station.size else {}
         if pressures:
-            (station,) = station_table(block, self.process).select(["time_s", *pressures]).to_batches()
-            series |= plot.at_times(batch_series(station), series["time_s"])
+            (station,) = file_sinks.station_table(block, self.process).select(["time_s", *pressures]).to_batches()
+            series |= plot.at_times(run_folder.batch_series(station), series["time_s"])
         identity = f"trace {self.summary['trace_sha256'][:12]}  ·  coldloop {__version__}  ·  in-process"
         process, events = self.process, self.events.arrow.to_pylist()
         edges, title = plot.edges_of(self.configuration, process), plot.title_of(self.configuration, process)
@@ -171,11 +169,11 @@ def _run(effective: Configuration[Settings], duration_s: float | str | None) -> 
         try:
             ticks = updating_periods.duration(duration_s).ticks(tick_s, "duration_s")
         except ArgumentTypeError as error:
-            raise UsageError(f"duration_s: {error}") from None
+            raise errors.UsageError(f"duration_s: {error}") from None
     elif duration_s is not None:
         ticks = updating_periods.whole_ticks(duration_s, tick_s)
         if ticks is None or ticks <= 0:
-            raise UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
+            raise errors.UsageError(f"duration_s={duration_s}: not a positive multiple of {tick_s} s")
     scenario = make_scenario(settings, ticks)
     model, design = lti_model.load(settings.model.file), settings.optimizer_plc.program.design
     evaluation, memory = RunEvaluation(model, design), MemorySink()

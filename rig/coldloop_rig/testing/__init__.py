@@ -23,12 +23,8 @@ from typing import Any, Final, Literal, NamedTuple, TypeVar
 from coldloop.errors import LinkError, PeerUnreachableError, UnfitValueError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
-from coldloop.registers import maps_of
-from coldloop.registers.common import Identity
-from coldloop.registers.declaration import Block, RegisterMap
-from coldloop_rig.cosim import wiring
-from coldloop_rig.cosim.networked_run import LocalServices
-from coldloop_rig.cosim.session import SessionClient
+from coldloop.registers import common, declaration, maps_of
+from coldloop_rig.cosim import networked_run, session, wiring
 from coldloop_rig.runs.running import check_certificates, make_scenario
 from coldloop_rig.settings import Period, Settings, configured
 
@@ -69,7 +65,7 @@ Record = tuple[Any, ...]
 
 
 class _Place(NamedTuple):
-    block: Block
+    block: declaration.Block
     field: str
     element: int | None
     """Index in an array; None is all of the field."""
@@ -87,7 +83,9 @@ class NamedRegisters:
     answer, and `RequestRefusedError`, with the `exception_code`, when it refuses the request.
     """
 
-    def __init__(self, register_map: RegisterMap, endpoint: Endpoint, client: RegisterClient, call: Call) -> None:
+    def __init__(
+        self, register_map: declaration.RegisterMap, endpoint: Endpoint, client: RegisterClient, call: Call
+    ) -> None:
         self._client = client
         self._call = call
         self._blocks = {block.name: block for block in register_map.blocks}
@@ -149,12 +147,12 @@ class NamedRegisters:
             reason = str(error).rpartition(": ")[2]
             raise UsageError(f"block '{block}' cannot hold {given}: {reason}") from None
 
-    def _record(self, block: Block, row: int) -> Any:  # noqa: ANN401 the record of that block
+    def _record(self, block: declaration.Block, row: int) -> Any:  # noqa: ANN401 the record of that block
         if not 0 <= row < block.rows:
             raise UsageError(f"block '{block.name}' has rows 0 to {block.rows - 1}, not {row}")
         return self._call(self._client.read_rows(block.record, row, 1))[0]
 
-    def _block(self, name: str) -> Block:
+    def _block(self, name: str) -> declaration.Block:
         if name not in self._blocks:
             raise UsageError(f"unknown block '{name}'; choose from {', '.join(self._blocks)}")
         return self._blocks[name]
@@ -182,12 +180,12 @@ class LiveRig:
         self._folder = folder
         self._links: wiring.Links = wiring.fault_injection("links")(str(settings.plant.seed))
         retained = wiring.retaining(settings, folder, always=True)
-        self._services = LocalServices(retained, folder / "logs", links=self._links)
+        self._services = networked_run.LocalServices(retained, folder / "logs", links=self._links)
         self.endpoints: wiring.RigEndpoints = self._services.endpoints
         """Endpoints of the services."""
         self._loop = BackgroundLoop()
         self._stack = AsyncExitStack()
-        self._driver = SessionClient(self.endpoints, settings)
+        self._driver = session.SessionClient(self.endpoints, settings)
         self._clients = {
             service: RegisterClient.at(register_map, endpoint)
             for service, register_map, endpoint in zip(wiring.SERVICES, maps, self.endpoints, strict=True)
@@ -214,13 +212,13 @@ class LiveRig:
             raise UsageError(f"advance({seconds}): not a positive multiple of {self._tick_s} s")
 
         async def advanced() -> int:
-            tick = (await self._clients["plant"].read(Identity)).tick
+            tick = (await self._clients["plant"].read(common.Identity)).tick
             until, moved = tick + round(ticks), time.monotonic()
             while tick < until:
                 if not self._scenario.realtime:
                     await self._driver.advance(tick, until)
                 await asyncio.sleep(LOOK_S)
-                before, tick = tick, (await self._clients["plant"].read(Identity)).tick
+                before, tick = tick, (await self._clients["plant"].read(common.Identity)).tick
                 if tick != before:
                     moved = time.monotonic()
                 elif time.monotonic() - moved > max(wiring.QUIET_S, 4 * self._tick_s / self._scenario.factor):

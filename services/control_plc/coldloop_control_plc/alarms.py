@@ -17,8 +17,7 @@ from typing import Annotated, Final, Literal, NamedTuple, Self
 
 from pydantic import AfterValidator, BaseModel, BeforeValidator, Field, FiniteFloat, model_validator
 
-from coldloop.process.declaration import Process
-from coldloop.process.sections import Range
+from coldloop.process import declaration, sections
 from coldloop.process.settings import ProcessSettings, declared, settings_process, stretched, within
 from coldloop.registers import common
 from coldloop.registers.common import Alarm, AlarmAction, AlarmCommand, AlarmKind, AlarmPriority, AlarmState, EventKind
@@ -101,7 +100,7 @@ class RuleSettings(BaseModel, frozen=True, extra="forbid"):
         )
 
 
-def _bands_of(process: Process) -> dict[str, Range]:
+def _bands_of(process: declaration.Process) -> dict[str, sections.Range]:
     return {one.name: one.alarm or one.edges for one in process.banded if one.edges is not None}
 
 

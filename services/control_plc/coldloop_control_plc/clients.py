@@ -7,28 +7,14 @@ from collections.abc import Awaitable, Callable, Mapping
 from typing import Final
 
 from coldloop.process.settings import InputLimits
+from coldloop.registers import common, declaration
 from coldloop.registers import control_plc as registers
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, RegisterBank
-from coldloop.registers.common import (
-    AlarmCommand,
-    AlarmKind,
-    AlarmState,
-    EventKind,
-    Identity,
-    JournalQuery,
-    LeaseEvent,
-    ServiceState,
-    SessionPace,
-    WatchdogTime,
-    pace_subject,
-)
-from coldloop.registers.declaration import Block, Role
 from coldloop.safety.writers import InputSequence, WriterLease
 from coldloop.service.journal import JournalPublication, alarm_word, log_event
 from coldloop.session import LatenessRecord, TimeBase
-from coldloop_control_plc.plant_link import PlantLink
+from coldloop_control_plc import plant_link, rack
 from coldloop_control_plc.program import ControlProgram
-from coldloop_control_plc.rack import Skew
 from coldloop_control_plc.sessions import Sessions
 
 log = logging.getLogger("coldloop.control_plc")
@@ -42,7 +28,12 @@ class ControlPublication:
     """
 
     def __init__(
-        self, program: ControlProgram, sessions: Sessions, link: PlantLink, bank: RegisterBank, keep: Callable[[], None]
+        self,
+        program: ControlProgram,
+        sessions: Sessions,
+        link: plant_link.PlantLink,
+        bank: RegisterBank,
+        keep: Callable[[], None],
     ) -> None:
         self._program = program
         self._sessions = sessions
@@ -54,7 +45,7 @@ class ControlPublication:
         self.begin()
         self.lease: WriterLease | None = None
         """Lease of the optimiser."""
-        bank.keep_fresh(Identity, self._identity)
+        bank.keep_fresh(common.Identity, self._identity)
         bank.keep_fresh(registers.ProcessNow, lambda: program.process)
         bank.keep_fresh(registers.Status, self._status)
 
@@ -64,15 +55,15 @@ class ControlPublication:
         """Scans that began too late."""
         self.lateness = LatenessRecord()
         """Lateness of all scans of this session in real time."""
-        self.skew, self.offset_ms = Skew(0.0, math.inf), 0.0
+        self.skew, self.offset_ms = rack.Skew(0.0, math.inf), 0.0
         """How much faster the rack's clock is than ours, and its phase error."""
 
-    def _identity(self) -> Identity:
+    def _identity(self) -> common.Identity:
         program = self._program
-        return Identity(
+        return common.Identity(
             map_digest=self.bank.map.digest,
             map_version=self.bank.map.version,
-            state=ServiceState.RUNNING if self._sessions.running else ServiceState.READY,
+            state=common.ServiceState.RUNNING if self._sessions.running else common.ServiceState.READY,
             model_digest=program.model_digest,
             session=program.session,
             tick=program.tick,
@@ -123,9 +114,9 @@ class ControlPublication:
         """Return what telemetry publishes."""
         status, process = self.bank.get(registers.Status), self.bank.get(registers.ProcessNow)
         alarms = {
-            alarm_word(kind, self.bank.map.process).replace(" ", "_"): AlarmState(alarm.state).name.lower()
+            alarm_word(kind, self.bank.map.process).replace(" ", "_"): common.AlarmState(alarm.state).name.lower()
             for kind, alarm in enumerate(self._program.alarms.rows)
-            if alarm.state != AlarmState.NORMAL
+            if alarm.state != common.AlarmState.NORMAL
         }
         return {
             "session": self._program.session,
@@ -178,7 +169,7 @@ class Clients:
         bank.judged_by(self._judge_optimizer, registers.SequenceRow, every_row=False)
         bank.judged_by(self._judge_operator, registers.Operator)
         bank.put_sealed(registers.Plan(0, 0))
-        bank.judged_by(self._judge_pace, SessionPace)
+        bank.judged_by(self._judge_pace, common.SessionPace)
 
     def _silence_s(self) -> float:
         """Return the silence, in real time, after which another optimiser may write."""
@@ -191,7 +182,7 @@ class Clients:
         try:
             self.lease.check(caller, record.holder if isinstance(record, registers.Heartbeat) else None)
         except BusyError:
-            self._program.alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
+            self._program.alarms.pulse(common.AlarmKind.SECOND_WRITER, SECOND_OPTIMIZER)
             raise
         if isinstance(record, registers.Plan) and not record.crc:
             raise IllegalValueError("a plan needs a CRC: it decides when inputs change")
@@ -202,7 +193,7 @@ class Clients:
             if not low <= value <= high:
                 raise IllegalValueError(f"setpoint of {name} = {value:g} is outside {low:g}..{high:g}")
 
-    def _judge_pace(self, asked: SessionPace, _row: int, _caller: Caller) -> None:
+    def _judge_pace(self, asked: common.SessionPace, _row: int, _caller: Caller) -> None:
         if self.asked is not None:
             raise IllegalValueError("pace: a session is about to begin")
         try:
@@ -232,10 +223,10 @@ class Clients:
             if update.update >= wanted or begun != self._begun:
                 _answer(answer)
 
-    def on_write(self, block: Block, caller: Caller) -> Awaitable[None] | None:
+    def on_write(self, block: declaration.Block, caller: Caller) -> Awaitable[None] | None:
         """Take what a client has written; an awaitable lets its answer wait."""
         present = self._program.optimizer_present
-        if block.writer is Role.OPTIMIZER:
+        if block.writer is declaration.Role.OPTIMIZER:
             wait = self._take(block, caller)
         else:
             wait = None
@@ -244,7 +235,7 @@ class Clients:
             self._publication.safety()
         return wait
 
-    def _take(self, block: Block, caller: Caller) -> Awaitable[None] | None:
+    def _take(self, block: declaration.Block, caller: Caller) -> Awaitable[None] | None:
         record, program = block.record, self._program
         beat = self._bank.get(registers.Heartbeat) if record is registers.Heartbeat else None
         self.lease.take(caller, beat.holder if beat else None)
@@ -261,11 +252,11 @@ class Clients:
             program.heartbeat(beat)
         return None
 
-    def _command(self, block: Block, caller: Caller) -> None:
+    def _command(self, block: declaration.Block, caller: Caller) -> None:
         command, who = self._bank.get(block.record), caller.name
         program, watchdog = self._program, self._program.watchdog
         match command:
-            case JournalQuery():
+            case common.JournalQuery():
                 self._publication.journal.answer(command)
                 return
             case registers.Grant():
@@ -274,19 +265,19 @@ class Clients:
                 return
             case registers.ControlSession():
                 self.asked, self.pending_time_base, self.granted = command, None, 0
-                self._note(EventKind.SESSION, command.realtime, who, value=command.factor)
-            case SessionPace():
+                self._note(common.EventKind.SESSION, command.realtime, who, value=command.factor)
+            case common.SessionPace():
                 pace = command.of(program.session)
-                self._bank.put(SessionPace.shown(program.session, pace))
+                self._bank.put(common.SessionPace.shown(program.session, pace))
                 if pace != (self.pending_time_base or self._sessions.pace):
                     self.pending_time_base = pace
-                    self._note(EventKind.PACE, pace_subject(pace), who, value=pace.factor)
+                    self._note(common.EventKind.PACE, common.pace_subject(pace), who, value=pace.factor)
             case registers.Operator():
                 self._operate(command, who)
-            case AlarmCommand():
+            case common.AlarmCommand():
                 program.alarms.command(command, who)
-            case WatchdogTime(time) if time != watchdog.time:
-                self._note(EventKind.WATCHDOG_TIME, time, who, cause=watchdog.time)
+            case common.WatchdogTime(time) if time != watchdog.time:
+                self._note(common.EventKind.WATCHDOG_TIME, time, who, cause=watchdog.time)
                 watchdog.set(time, program.tick)
         self.changed.set()
         self._publication.safety()
@@ -294,16 +285,16 @@ class Clients:
     def _operate(self, operator: registers.Operator, who: str) -> None:
         before = self._program.operator
         if operator.mode != before.mode:
-            self._note(EventKind.OPERATOR_MODE, operator.mode, who)
+            self._note(common.EventKind.OPERATOR_MODE, operator.mode, who)
         for place, (value, last) in enumerate(zip(operator.u, before.u, strict=True)):
             if abs(value - last) > 1e-4:  # those that are written back as they were read have not been changed
-                self._note(EventKind.SETPOINT, place, who, value=value)
+                self._note(common.EventKind.SETPOINT, place, who, value=value)
         self._program.operate(operator)
 
-    def _note_lease(self, event: LeaseEvent, who: str) -> None:
-        self._note(EventKind.LEASE, event, who)
+    def _note_lease(self, event: common.LeaseEvent, who: str) -> None:
+        self._note(common.EventKind.LEASE, event, who)
 
-    def _note(self, kind: EventKind, subject: int, who: str, *, cause: int = 0, value: float = 0.0) -> None:
+    def _note(self, kind: common.EventKind, subject: int, who: str, *, cause: int = 0, value: float = 0.0) -> None:
         now = max(self._program.tick, self._program.alarms.now)
         self._program.journal.note(now, kind, subject, cause, value=value, who=who)
 
@@ -347,9 +338,9 @@ class Clients:
         latched = self._program.player.update
         return latched is not None and latched.update >= wanted
 
-    def on_departure(self, role: Role) -> None:
+    def on_departure(self, role: declaration.Role) -> None:
         """The last client of this role has disconnected: do not wait for an optimiser."""
-        if role is Role.OPTIMIZER:
+        if role is declaration.Role.OPTIMIZER:
             self._program.optimizer_lost()
             self._publication.safety()
             self.changed.set()
@@ -361,7 +352,7 @@ class Clients:
     def on_refusal(self, kind: str) -> None:
         """A server has refused a client's request."""
         if kind == "access_refused":
-            self._program.alarms.pulse(AlarmKind.ACCESS_REFUSED)
+            self._program.alarms.pulse(common.AlarmKind.ACCESS_REFUSED)
 
 
 def _answer(waiting: asyncio.Future[None]) -> None:

@@ -11,9 +11,8 @@ import math
 from collections.abc import Mapping
 from typing import Final
 
-from coldloop.registers.common import AlarmKind, EventKind
+from coldloop.registers import common, plant
 from coldloop.registers.control_plc import LinkCause, PlantLinkState, PlantLinkStatus
-from coldloop.registers.plant import Actuators, Measurement, OutputVerdict
 from coldloop.service.journal import Journal
 from coldloop_control_plc.alarms import AlarmPanel
 
@@ -23,11 +22,11 @@ FROZEN_S: Final = 0.5
 """... and for so long: a rack that is short of processor time is late, not frozen."""
 
 ALARMS: Final = {
-    PlantLinkState.SEARCHING: AlarmKind.PLANT_LOST,
-    PlantLinkState.JOINING: AlarmKind.PLANT_LOST,
-    PlantLinkState.REJECTED: AlarmKind.OUTPUTS_REJECTED,
-    PlantLinkState.OTHER_MASTER: AlarmKind.PLANT_OTHER_MASTER,
-    PlantLinkState.FROZEN: AlarmKind.PLANT_FROZEN,
+    PlantLinkState.SEARCHING: common.AlarmKind.PLANT_LOST,
+    PlantLinkState.JOINING: common.AlarmKind.PLANT_LOST,
+    PlantLinkState.REJECTED: common.AlarmKind.OUTPUTS_REJECTED,
+    PlantLinkState.OTHER_MASTER: common.AlarmKind.PLANT_OTHER_MASTER,
+    PlantLinkState.FROZEN: common.AlarmKind.PLANT_FROZEN,
 }
 SECOND_MASTER: Final = 2
 """Cause of the alarm SECOND_WRITER."""
@@ -42,10 +41,10 @@ FAILED_REQUESTS: Final = {
 """States that a failed request leads to; after others the rack does not answer."""
 OUTPUTS_REJECTED: Final = (PlantLinkState.REJECTED, LinkCause.REFUSED)
 REFUSED_OUTPUTS: Final[Mapping[int, tuple[PlantLinkState, LinkCause]]] = {
-    OutputVerdict.WRONG_SESSION: (PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION),
-    OutputVerdict.STALE: (PlantLinkState.REJECTED, LinkCause.STALE),
-    OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
-    OutputVerdict.LIMITED: (PlantLinkState.JOINING, LinkCause.LIMITED),
+    plant.OutputVerdict.WRONG_SESSION: (PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION),
+    plant.OutputVerdict.STALE: (PlantLinkState.REJECTED, LinkCause.STALE),
+    plant.OutputVerdict.CHANGED: (PlantLinkState.JOINING, LinkCause.CHANGED),
+    plant.OutputVerdict.LIMITED: (PlantLinkState.JOINING, LinkCause.LIMITED),
 }
 
 
@@ -68,7 +67,7 @@ class PlantLink:
         """How long the rack's tick may stand, in ticks of our clock."""
         self.generation = 0
         """Generation of the rack's outputs that was read back; 0 is none."""
-        self._read: tuple[Measurement, float | None] | None = None
+        self._read: tuple[plant.Measurement, float | None] | None = None
         """The last reading, and when it was made: the next one is to confirm it."""
         self.is_confirmed = False
         """The last reading said what the one before had said."""
@@ -132,7 +131,7 @@ class PlantLink:
         if self.synchronised:
             self._enter(PlantLinkState.JOINING, LinkCause.TIME_BASE)
 
-    def compare(self, reading: Measurement, session: int, now: float | None) -> None:
+    def compare(self, reading: plant.Measurement, session: int, now: float | None) -> None:
         """Note whether a reading without a write, its seal intact, confirms the one before.
 
         In another session than ours the rack may have another time base, and its ticks say nothing. `now` is real time,
@@ -153,7 +152,7 @@ class PlantLink:
         in_time = in_time and not self._is_old(reading, now)
         self.is_confirmed = same and (in_time or reading.session != session)
 
-    def read_back(self, reading: Measurement, session: int, now: float | None) -> bool:
+    def read_back(self, reading: plant.Measurement, session: int, now: float | None) -> bool:
         """Judge a reading that was compared; return whether outputs may be written from it on."""
         stopped = self._clock_stopped(reading, now)
         self.refused = reading.refused
@@ -167,13 +166,13 @@ class PlantLink:
             self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
         else:
             if self.generation not in (0, reading.generation):  # another master, or its watchdog, has moved the outputs
-                self._alarms.raised(AlarmKind.PLANT_LOST, LinkCause.CHANGED)
+                self._alarms.raised(common.AlarmKind.PLANT_LOST, LinkCause.CHANGED)
             self.generation, self._read = reading.generation, None
             self._known_place = reading.tick + reading.age
             return True
         return False
 
-    def addressed(self, outputs: Actuators) -> Actuators:
+    def addressed(self, outputs: plant.Actuators) -> plant.Actuators:
         """Return outputs as they are sent: from us, to the generation that was read back."""
         return outputs._replace(holder=self.holder, generation=self.generation)
 
@@ -181,7 +180,7 @@ class PlantLink:
         """The program has resumed from what was read back: outputs may be written."""
         self._enter(PlantLinkState.SYNCHRONISED, self.cause)
 
-    def exchanged(self, sent: Actuators, answer: Measurement, now: float | None) -> bool:
+    def exchanged(self, sent: plant.Actuators, answer: plant.Measurement, now: float | None) -> bool:
         """Judge the answer to outputs; return whether they are what the rack applies, at their tick.
 
         In real time the rack's tick may differ by one: it changes between two scans, and a scan may be late.
@@ -190,8 +189,8 @@ class PlantLink:
         before, self._has_refused_more = self._has_refused_more, answer.refused != self.refused
         if before and self._has_refused_more:  # two answers show that the rack has refused another master's outputs
             self.refused, self._has_refused_more = answer.refused, False
-            self._alarms.pulse(AlarmKind.SECOND_WRITER, SECOND_MASTER)
-        if answer.verdict != OutputVerdict.ACCEPTED:
+            self._alarms.pulse(common.AlarmKind.SECOND_WRITER, SECOND_MASTER)
+        if answer.verdict != plant.OutputVerdict.ACCEPTED:
             self._enter(*REFUSED_OUTPUTS.get(answer.verdict, OUTPUTS_REJECTED))
         elif answer.session != sent.session:
             self._enter(PlantLinkState.OTHER_MASTER, LinkCause.WRONG_SESSION)
@@ -216,7 +215,7 @@ class PlantLink:
         """Forget what was noted in ticks of a time base that may be another now."""
         self._moved_at = self._old_since = self._read = None
 
-    def _is_old(self, reading: Measurement, now: float | None) -> bool:
+    def _is_old(self, reading: plant.Measurement, now: float | None) -> bool:
         """Return whether a reading is of a time before what is known, as from a gateway that is behind.
 
         A rack that was started again may be back in time: it is believed when it has been seen there for long enough.
@@ -228,7 +227,7 @@ class PlantLink:
             self._old_since = now
         return reading.tick > 0 and now - self._old_since < self.frozen_ticks
 
-    def _clock_stopped(self, reading: Measurement, now: float | None) -> bool:
+    def _clock_stopped(self, reading: plant.Measurement, now: float | None) -> bool:
         """Note where the rack is; return whether its clock has stopped. At tick 0 it waits for the first outputs."""
         moved = (reading.session, reading.tick) != (self.session, self.tick)
         self.session, self.tick = reading.session, reading.tick
@@ -257,7 +256,7 @@ class PlantLink:
 
     def _note(self, state: PlantLinkState) -> None:
         self._noted = state
-        self._journal.note(self._alarms.now, EventKind.PLANT_LINK, state, self.cause)
+        self._journal.note(self._alarms.now, common.EventKind.PLANT_LINK, state, self.cause)
 
     def _alarm(self, state: PlantLinkState, cause: LinkCause) -> None:
         """Raise the alarm of a state; those of the states before return when a scan is taken, or another is raised."""

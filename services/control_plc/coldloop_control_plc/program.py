@@ -14,15 +14,14 @@ from coldloop.errors import ConfigurationError
 from coldloop.process.lti_model import ModelHeader
 from coldloop.process.settings import InputLimits
 from coldloop.registers import control_plc as registers
+from coldloop.registers import plant
 from coldloop.registers.common import Alarm, AlarmKind, CapacityCause, EventKind
 from coldloop.registers.control_plc import Cause, CoolDownStep, Mode, Operator, OperatorMode, ProcessNow, Update
-from coldloop.registers.plant import Actuators, Measurement
 from coldloop.safety.watchdog import Watchdog
 from coldloop.safety.writers import Inputs, InputSequence
 from coldloop.service.journal import Journal
-from coldloop_control_plc import scan
+from coldloop_control_plc import output_limits, scan
 from coldloop_control_plc.alarms import NOT, AlarmPanel
-from coldloop_control_plc.output_limits import OutputGuard
 from coldloop_control_plc.player import SequencePlayer, awaits_sequence, latches
 from coldloop_control_plc.sensors import NONE, SensorMonitor
 from coldloop_control_plc.settings import ControlSection, ControlStrategy
@@ -56,7 +55,7 @@ class ControlProgram:
         self._section = section
         self.alarm_settings = section.alarms
         self._initial = tuple(point.inputs)
-        if OutputGuard(limits, self._initial).out_of_range([self._initial]):
+        if output_limits.OutputGuard(limits, self._initial).out_of_range([self._initial]):
             raise ConfigurationError(
                 f"limits: the inputs {self._initial} of the operating point are outside; widen low and high, or "
                 "give another model.file"
@@ -116,7 +115,7 @@ class ControlProgram:
         self.session, self.tick = session, tick
         self.process: ProcessNow | None = None
         limits, point, section = self._limits, self._point, self._section
-        self.guard = OutputGuard(limits, self._initial)
+        self.guard = output_limits.OutputGuard(limits, self._initial)
         if applied != self._initial:
             self.guard.begin_at(tick, applied)
         self._before = self.guard.applied
@@ -192,7 +191,7 @@ class ControlProgram:
 
     # -- scan ----------------------------------------------------------------------------------------------------------
 
-    def begin_scan(self) -> Actuators:
+    def begin_scan(self) -> plant.Actuators:
         """Decide the outputs of this tick."""
         tick = self.alarms.now = self.tick
         self._in_scan = True
@@ -200,19 +199,19 @@ class ControlProgram:
         self.ladder.operator, self.ladder.setpoints[:] = self.operator
         scan.decide(self.scan_constants, self.scan, tick, self.player.rows)
         self._note_mode()
-        return Actuators(tick, self.guard.applied, self.session)
+        return plant.Actuators(tick, self.guard.applied, self.session)
 
     def _note_mode(self) -> None:
         if self._noted != (self.ladder.mode, self.ladder.cause):
             self._noted = self.ladder.mode, self.ladder.cause
             self.journal.note(self.tick, EventKind.MODE, *self._noted)
 
-    def end_scan(self, measurement: Measurement) -> Update | None:
+    def end_scan(self, measurement: plant.Measurement) -> Update | None:
         """Take the measurement of this tick; return the update if it was latched here."""
         scan.observe(self.scan_constants, self.scan, self.tick, measurement.y, measurement.x, measurement.load)
         return self.conclude(measurement)
 
-    def conclude(self, measurement: Measurement) -> Update | None:
+    def conclude(self, measurement: plant.Measurement) -> Update | None:
         """Do what follows when the measurement of this tick has been observed; return the update if one is latched."""
         tick, applied, sensors, load = self.tick, self.guard.applied, self.sensors, measurement.load
         y = tuple(sensors.good) if sensors.bad_count else measurement.y
@@ -291,7 +290,7 @@ class ControlProgram:
             and not any(alarms.active[kind] for kind in answers)
         )
 
-    def take_over(self, measurement: Measurement, before: Inputs, *, concluded: bool) -> Update | None:
+    def take_over(self, measurement: plant.Measurement, before: Inputs, *, concluded: bool) -> Update | None:
         """Continue after such scans, with the measurement of the last one, which may be still to be concluded.
 
         `before` was applied before that scan. Returns the update if it was latched in the conclusion.

@@ -13,27 +13,16 @@ import time
 from collections.abc import Sequence
 from typing import Final
 
-from coldloop import __version__
-from coldloop.config import selected
-from coldloop.errors import ConfigurationError, LinkError, PeerUnreachableError
+from coldloop import __version__, config, errors
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import TlsSettings
-from coldloop.process.declaration import LAST_TICK
-from coldloop.process.lti_model import read_header
-from coldloop.registers import maps_of
-from coldloop.registers.bank import RegisterBank
-from coldloop.registers.common import AlarmKind, EventKind, SessionPace, WatchdogTime, publish_configuration
-from coldloop.registers.control_plc import ControlSession
-from coldloop.registers.plant import Measurement
-from coldloop.service.monitoring import MetricsServer, Telemetry
-from coldloop.service.start import SERVING, dropped
+from coldloop.process import declaration, lti_model
+from coldloop.registers import bank, common, control_plc, maps_of, plant
+from coldloop.service import monitoring, start
 from coldloop.session import TimeBase
-from coldloop_control_plc.clients import Clients, ControlPublication
-from coldloop_control_plc.plant_link import FROZEN_S, FROZEN_TICKS, PlantLink
+from coldloop_control_plc import clients, plant_link, rack, sessions
 from coldloop_control_plc.program import make_program
-from coldloop_control_plc.rack import PHASE, RackClock, RackFinder, ScanCycle
-from coldloop_control_plc.sessions import ControlStateStore, Sessions
 from coldloop_control_plc.settings import SHOWN, ControlSettings
 
 log = logging.getLogger("coldloop.control_plc")
@@ -56,28 +45,28 @@ class ControlPlc:
     """Connects the program to the registers and to the rack."""
 
     def __init__(self, settings: ControlSettings) -> None:
-        header = read_header(settings.model.file)
+        header = lti_model.read_header(settings.model.file)
         process, maps = settings.process, maps_of(settings.process)
         section = settings.control_plc
         self._settings = settings
-        self._store = ControlStateStore(section.retain.file, header.short_digest, process)
+        self._store = sessions.ControlStateStore(section.retain.file, header.short_digest, process)
         recalled = self._store.recall()
         self._program = program = make_program(header, section, settings.limits)
         program.journal.continue_from(self._store.boot, recalled.events if recalled else 0)
         if recalled is not None:
             program.recall(recalled.operator, recalled.alarms, recalled.watchdog, recalled.tick)
-        self.sessions = Sessions(program, settings.session, recalled)
-        self._link = PlantLink(program.alarms, program.journal, self._store.holder)
-        self._cycle = ScanCycle(program, self._link, self._adopt)
+        self.sessions = sessions.Sessions(program, settings.session, recalled)
+        self._link = plant_link.PlantLink(program.alarms, program.journal, self._store.holder)
+        self._cycle = rack.ScanCycle(program, self._link, self._adopt)
         self._plant = RegisterClient.at(maps.plant, section.plant)
-        self._clock = RackClock(self.sessions.pace.factor, time.monotonic(), process.tick_s)
+        self._clock = rack.RackClock(self.sessions.pace.factor, time.monotonic(), process.tick_s)
         if self.sessions.kept is not None:
-            self._clock.synchronise(self.sessions.kept.tick + PHASE, time.monotonic())
-        self._finder = RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
-        self.bank = RegisterBank(maps.control_plc, section.word_order)
-        publish_configuration(self.bank, selected(settings, SHOWN))
-        self.publication = ControlPublication(program, self.sessions, self._link, self.bank, self._keep)
-        self.clients = Clients(program, settings.limits, self.publication, self.sessions)
+            self._clock.synchronise(self.sessions.kept.tick + rack.PHASE, time.monotonic())
+        self._finder = rack.RackFinder(self._plant, self._link, self._cycle, self._clock, power_up_s=section.power_up_s)
+        self.bank = bank.RegisterBank(maps.control_plc, section.word_order)
+        common.publish_configuration(self.bank, config.selected(settings, SHOWN))
+        self.publication = clients.ControlPublication(program, self.sessions, self._link, self.bank, self._keep)
+        self.clients = clients.Clients(program, settings.limits, self.publication, self.sessions)
         self._looks = 0
         """Looks without a scan between them."""
         self._ticks_per_second = max(1, round(1 / process.tick_s))
@@ -86,12 +75,14 @@ class ControlPlc:
         self._repaced = -REPACED_S
         """Time of the last change of the time base, s."""
         self.bank.put(program.operator)
-        self.bank.put(WatchdogTime(program.watchdog.time))
-        program.journal.note(program.alarms.now, EventKind.BOOT, int(recalled is not None), int(self._store.refused))
+        self.bank.put(common.WatchdogTime(program.watchdog.time))
+        program.journal.note(
+            program.alarms.now, common.EventKind.BOOT, int(recalled is not None), int(self._store.refused)
+        )
         if self.sessions.kept is not None:
             self._link.starting()  # other clients must not take this for a PLC without a session
         if self._store.refused:
-            program.alarms.raised(AlarmKind.STATE_NOT_RETAINED, 1)  # cause: there was one that is not used
+            program.alarms.raised(common.AlarmKind.STATE_NOT_RETAINED, 1)  # cause: there was one that is not used
         self.publication.safety()
 
     def close(self) -> None:
@@ -145,7 +136,7 @@ class ControlPlc:
         self.publication.lateness.add(lateness)
         if lateness * 1000 > self._settings.control_plc.scan_tolerance_ms:
             self.publication.overruns += 1
-            program.alarms.pulse(AlarmKind.SCAN_OVERRUN)
+            program.alarms.pulse(common.AlarmKind.SCAN_OVERRUN)
         if lateness > self._clock.tick_s and program.tick:  # at tick 0 the rack's clock waits for us
             self._link.missed_scans()
         return self._link.synchronised
@@ -172,8 +163,8 @@ class ControlPlc:
             async with asyncio.timeout(1.0):  # s, then the rack is asked something
                 await self.clients.changed.wait()
         except TimeoutError:
-            with contextlib.suppress(LinkError):  # the rack is read when time resumes
-                await self._plant.read(Measurement)
+            with contextlib.suppress(errors.LinkError):  # the rack is read when time resumes
+                await self._plant.read(plant.Measurement)
 
     async def _until_granted(self) -> bool:
         """Wait until the next scan in lock-step has what it needs; return whether it may begin."""
@@ -213,9 +204,9 @@ class ControlPlc:
         asked_at = time.monotonic()
         try:
             if not self._plant.connected:  # a new connection is a break: the rack is read before it is written to
-                raise PeerUnreachableError(f"{self._plant.peer} has closed the connection")
-            answer = await self._plant.exchange(outputs, Measurement, patience_s=self._patience_s)
-        except LinkError as error:
+                raise errors.PeerUnreachableError(f"{self._plant.peer} has closed the connection")
+            answer = await self._plant.exchange(outputs, plant.Measurement, patience_s=self._patience_s)
+        except errors.LinkError as error:
             self._finder.failed(error)
             self.publication.safety()
             return
@@ -257,11 +248,11 @@ class ControlPlc:
             self.publication.offset_ms = self._clock.offset * self._clock.tick_s * 1000
             limit = self._settings.control_plc.skew_alarm_ppm
             known = skew.error_ppm < limit / 4
-            self._program.alarms.report(AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
-        program, lost = self._program, dropped()
-        program.alarms.report(AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
+            self._program.alarms.report(common.AlarmKind.CLOCK_SKEW, condition=known and abs(skew.ppm) > limit)
+        program, lost = self._program, start.dropped()
+        program.alarms.report(common.AlarmKind.STATE_NOT_RETAINED, condition=self._store.failure is not None)
         if lost > self._lost_lines:
-            program.journal.note(program.tick, EventKind.LOST, value=lost - self._lost_lines)
+            program.journal.note(program.tick, common.EventKind.LOST, value=lost - self._lost_lines)
             self._lost_lines = lost
 
     async def watch_scans(self) -> None:
@@ -274,8 +265,8 @@ class ControlPlc:
             # 8 looks, or where the factor is low 8 scans; a process that had no processor time has not looked either
             missing = self._looks > max(8, 8 * self._clock.tick_s / LOOK_S)
             stopped = missing and not self._link.is_alarmed
-            if stopped is not bool(alarms.rows[AlarmKind.SCANS_STOPPED].active):
-                alarms.report(AlarmKind.SCANS_STOPPED, condition=stopped)
+            if stopped is not bool(alarms.rows[common.AlarmKind.SCANS_STOPPED].active):
+                alarms.report(common.AlarmKind.SCANS_STOPPED, condition=stopped)
                 self.publication.safety()
 
     async def watch_certificates(self) -> None:
@@ -285,15 +276,15 @@ class ControlPlc:
         while certificates:
             try:
                 days = await asyncio.to_thread(_days_of_those_to_renew, certificates)  # no scan waits for a disk
-            except ConfigurationError as error:  # they may be being renewed: keep what was read at the start
+            except errors.ConfigurationError as error:  # they may be being renewed: keep what was read at the start
                 log.warning("certificates unreadable", extra={"reason": str(error)})
-                alarms.raised(AlarmKind.CERTIFICATE, UNREADABLE)
+                alarms.raised(common.AlarmKind.CERTIFICATE, UNREADABLE)
             else:
                 least = min(days, default=0.0)
                 cause = (EXPIRED if least < 0.0 else EXPIRES_SOON) if days else 0
-                alarms.report(AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
+                alarms.report(common.AlarmKind.CERTIFICATE, condition=bool(days), cause=cause)
                 if cause and cause != noted:
-                    self._program.journal.note(alarms.now, EventKind.CERTIFICATE, cause, value=least)
+                    self._program.journal.note(alarms.now, common.EventKind.CERTIFICATE, cause, value=least)
                 noted = cause
             self.publication.safety()
             await asyncio.sleep(CERTIFICATES_S)
@@ -316,11 +307,11 @@ class ControlPlc:
                 self._link.end()
             if realtime:
                 now = self._clock.tick_at(time.monotonic())
-                self._program.alarms.now = min(max(self._program.tick, now), LAST_TICK)
+                self._program.alarms.now = min(max(self._program.tick, now), declaration.LAST_TICK)
                 self._program.alarms.pass_by()
         self.publication.safety()
 
-    def _adopt(self, reading: Measurement) -> bool:
+    def _adopt(self, reading: plant.Measurement) -> bool:
         """Go over to the session of the rack, where that is ours to do."""
         adopted = self.sessions.adopt(reading)
         self.bank.put(self._program.operator)
@@ -328,7 +319,7 @@ class ControlPlc:
             self._begin()
         return adopted
 
-    def _start(self, asked: ControlSession) -> None:
+    def _start(self, asked: control_plc.ControlSession) -> None:
         """Begin the session requested by an operator; nothing is written before the rack has been read."""
         self.clients.asked = None
         self.sessions.start(asked)
@@ -359,12 +350,12 @@ class ControlPlc:
         self._clock.begin(self.sessions.pace.factor, time.monotonic())
         self._finder.read_soon()
         self._cycle.begin_time()
-        self._link.frozen_ticks = max(FROZEN_TICKS, FROZEN_S / self._clock.tick_s)
+        self._link.frozen_ticks = max(plant_link.FROZEN_TICKS, plant_link.FROZEN_S / self._clock.tick_s)
 
     def _show_pace(self) -> None:
         pace, session = self.sessions.pace, self._program.session
-        self.bank.put(ControlSession(session, int(pace.realtime), pace.factor))
-        self.bank.put(SessionPace.shown(session, pace))
+        self.bank.put(control_plc.ControlSession(session, int(pace.realtime), pace.factor))
+        self.bank.put(common.SessionPace.shown(session, pace))
 
 
 def _days_of_those_to_renew(certificates: Sequence[TlsSettings]) -> list[float]:
@@ -382,14 +373,14 @@ async def serve(settings: ControlSettings) -> None:
         on_departure=plc.clients.on_departure, on_refusal=plc.clients.on_refusal, on_close=plc.clients.on_close,
     )  # fmt: skip
     await server.start()
-    log.info(SERVING, extra={"host": settings.control_plc.server.host, "port": server.port})
+    log.info(start.SERVING, extra={"host": settings.control_plc.server.host, "port": server.port})
     try:
         async with asyncio.TaskGroup() as tasks:
-            tasks.create_task(MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")
+            tasks.create_task(monitoring.MetricsServer(settings.control_plc.metrics, plc.bank).run(), name="metrics")
             tasks.create_task(plc.run(), name="scan cycle")
             tasks.create_task(plc.watch_scans(), name="scan watch")
             tasks.create_task(plc.watch_certificates(), name="certificates")
-            telemetry = Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
+            telemetry = monitoring.Telemetry(settings.telemetry, "control_plc", plc.publication.snapshot)
             tasks.create_task(telemetry.run(), name="telemetry")
     finally:
         plc.close()

@@ -17,12 +17,8 @@ from pydantic import Field, ValidationError, model_validator
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
 from coldloop.process.settings import ProcessSettings, settings_of
-from coldloop.registers import control_plc
-from coldloop.registers.codec import check_record
-from coldloop.registers.common import Alarm, SessionPace, alarms_of
-from coldloop.registers.plant import Measurement
-from coldloop.safety.retained import RetainedFile, RetainedStateError, RetainedStateWriter
-from coldloop.safety.writers import InputSequence, checksum
+from coldloop.registers import codec, common, control_plc, plant
+from coldloop.safety import retained, writers
 from coldloop.session import SessionSettings, TimeBase, TimeMode
 from coldloop_control_plc.program import ControlProgram
 
@@ -60,18 +56,18 @@ class RetainedControlState(ProcessSettings):
     operator: control_plc.Operator
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]
     """Time-out of the optimiser's watchdog, in ticks."""
-    alarms: list[Alarm]
+    alarms: list[common.Alarm]
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        if len(self.alarms) != len(alarms_of(self.process)):
-            raise ValueError(f"{len(self.alarms)} alarms of {len(alarms_of(self.process))}")
+        if len(self.alarms) != len(common.alarms_of(self.process)):
+            raise ValueError(f"{len(self.alarms)} alarms of {len(common.alarms_of(self.process))}")
         registers = control_plc.control_map(self.process)
-        for record in (SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
-            check_record(record, registers)
+        for record in (common.SessionPace.shown(self.session, self.pace), self.operator, *self.alarms):
+            codec.check_record(record, registers)
         if self.playing is not None:
             header, rows = self.playing
-            check_record(header, registers)
+            codec.check_record(header, registers)
             if len(rows) > 2 * control_plc.SEQUENCE_ROWS * _row(self.process).size:
                 raise ValueError("a sequence longer than the longest")
         return self
@@ -87,10 +83,10 @@ class RetainedControlState(ProcessSettings):
             with settings_of(process):
                 return cls.model_validate(content)
         except ValidationError as error:
-            raise RetainedStateError(f"the retained state is not used: {error.errors()[0]['msg']}") from None
+            raise retained.RetainedStateError(f"the retained state is not used: {error.errors()[0]['msg']}") from None
 
     @property
-    def sequence(self) -> InputSequence | None:
+    def sequence(self) -> writers.InputSequence | None:
         """The sequence being played, where it is whole."""
         if self.playing is None:
             return None
@@ -99,7 +95,7 @@ class RetainedControlState(ProcessSettings):
             rows = list(_row(self.process).iter_unpack(base64.b64decode(text)))
         except (ValueError, struct.error):
             return None
-        return InputSequence(header, rows) if checksum(header, rows) == header.crc else None
+        return writers.InputSequence(header, rows) if writers.checksum(header, rows) == header.crc else None
 
 
 class ControlStateStore:
@@ -110,9 +106,9 @@ class ControlStateStore:
 
     def __init__(self, file: Path | None, model_digest: int, process: Process) -> None:
         self._process, self._row = process, _row(process)
-        self._file = RetainedFile(file, OWNER, model_digest) if file else None
-        self._writer = RetainedStateWriter(self._file) if self._file else None
-        self._packed: tuple[InputSequence, tuple[control_plc.SequenceHeader, str]] | None = None
+        self._file = retained.RetainedFile(file, OWNER, model_digest) if file else None
+        self._writer = retained.RetainedStateWriter(self._file) if self._file else None
+        self._packed: tuple[writers.InputSequence, tuple[control_plc.SequenceHeader, str]] | None = None
         self.refused = False
         """A previous state exists and is not used."""
         self.boot = 1
@@ -125,7 +121,7 @@ class ControlStateStore:
         try:
             content = self._file.load()
             state = None if content is None else RetainedControlState.parsed(content, self._process)
-        except RetainedStateError as error:
+        except retained.RetainedStateError as error:
             self.refused = True
             log.warning("retained state refused", extra={"reason": str(error), "file": self._file.set_aside()})
             return None
@@ -157,7 +153,7 @@ class ControlStateStore:
             "alarms": tuple(program.alarms.rows),
         }  # fmt: skip
 
-    def _playing(self, sequence: InputSequence | None) -> tuple[control_plc.SequenceHeader, str] | None:
+    def _playing(self, sequence: writers.InputSequence | None) -> tuple[control_plc.SequenceHeader, str] | None:
         if sequence is None:
             return None
         if self._packed is None or self._packed[0] is not sequence:
@@ -213,7 +209,7 @@ class Sessions:
         self._begin()
         log.info("session started", extra={"session": asked.session, "realtime": bool(asked.realtime)})
 
-    def adopt(self, reading: Measurement) -> bool:
+    def adopt(self, reading: plant.Measurement) -> bool:
         """Go over to the session of the rack, where that is ours to do; return whether it was."""
         program, kept = self._program, self.kept
         if kept is not None and kept.session == reading.session != 0:

@@ -7,10 +7,8 @@ from typing import Annotated, Final, Self
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, PositiveFloat, model_validator
 
 from coldloop.modbus.settings import CONTROL_PORT, PLANT_PORT, Endpoint, ServerSettings
-from coldloop.process.cold_box import LEVEL_LOOP, T5_LOOP
-from coldloop.process.sections import Band, Loop
+from coldloop.process import cold_box, sections, updating_periods
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, stretched, within
-from coldloop.process.updating_periods import whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
 from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
@@ -61,22 +59,22 @@ class PiSettings(BaseModel):
     """Setpoint less the output at the operating point of the model file, in the unit of the output."""
 
 
-def _declared(loop: Loop, band: Band) -> PiSettings:
+def _declared(loop: sections.Loop, band: sections.Band) -> PiSettings:
     return PiSettings(gain=loop.gain, integral_time_s=loop.integral_time_s, setpoint_offset=band.setpoint_offset)
 
 
 class TemperatureLoop(PiSettings):
     """T5 (K) by CV156 (%): gain in % per K."""
 
-    gain: FiniteFloat = T5_LOOP.gain
-    integral_time_s: PositiveFloat = T5_LOOP.integral_time_s
+    gain: FiniteFloat = cold_box.T5_LOOP.gain
+    integral_time_s: PositiveFloat = cold_box.T5_LOOP.integral_time_s
 
 
 class LevelLoop(PiSettings):
     """L1 (%) by NCR22_A (W): gain in W per %."""
 
-    gain: FiniteFloat = LEVEL_LOOP.gain
-    integral_time_s: PositiveFloat = LEVEL_LOOP.integral_time_s
+    gain: FiniteFloat = cold_box.LEVEL_LOOP.gain
+    integral_time_s: PositiveFloat = cold_box.LEVEL_LOOP.integral_time_s
 
 
 class ClassicalSettings(ProcessSettings):
@@ -105,7 +103,7 @@ class ClassicalSettings(ProcessSettings):
 
     @model_validator(mode="after")
     def _whole_ticks(self) -> Self:
-        if whole_ticks(self.period_s, self.process.tick_s) is None:
+        if updating_periods.whole_ticks(self.period_s, self.process.tick_s) is None:
             raise ValueError(f"period_s must be a multiple of the tick, {self.process.tick_s} s")
         return self
 

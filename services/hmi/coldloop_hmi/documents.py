@@ -20,11 +20,10 @@ from coldloop.process.sections import Output, Range
 from coldloop.registers import codec, common, control_plc, declaration, optimizer_plc, plant
 from coldloop.registers.common import AlarmAction, AlarmPriority, AlarmState
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, Prediction
-from coldloop.service.journal import alarm_cause, alarm_word, flag_words
-from coldloop.service.monitoring import block_families, build_family, gauge
+from coldloop.service import journal, monitoring
 from coldloop.text import finite_json
+from coldloop_hmi import explanation
 from coldloop_hmi import process_image as image
-from coldloop_hmi.explanation import deviation, explain, sentence
 
 KIND: Final = "plant.kind"
 REFRIGERATOR: Final = "refrigerator"
@@ -195,7 +194,7 @@ def plant_document(model: image.Model) -> dict[str, Any]:
     return {
         "kind": kind,
         "mode": plant.StationMode.word_of(status.mode),
-        "alarms": flag_words(plant.StationAlarm(status.alarms)),
+        "alarms": journal.flag_words(plant.StationAlarm(status.alarms)),
         "bands": {
             f"{SIGNALS}{name}": [model.configuration.get(f"{ALARMS}{key}") for key in keys]
             for name, keys in LIMITS.items()
@@ -250,10 +249,10 @@ def alarms_document(model: image.Model) -> list[Document]:
     return [
         {
             "number": kind,
-            "name": alarm_word(kind, process),
+            "name": journal.alarm_word(kind, process),
             "state": AlarmState.word_of(alarm.state),
             "active": bool(alarm.active),
-            "cause": alarm_cause(kind, alarm.cause, process) if alarm.times else "",
+            "cause": journal.alarm_cause(kind, alarm.cause, process) if alarm.times else "",
             "priority": int(alarm.priority),
             "priority_word": AlarmPriority.word_of(alarm.priority),
             "times": alarm.times,
@@ -302,7 +301,7 @@ def state_document(model: image.Model, changed: Iterable[str] | None = None) -> 
         "time_s": model.tick * process.tick_s,
         "services": services_document(model),
         "plant": plant_document(model),
-        "deviation": deviation(found, process, model.doubts.suspect),
+        "deviation": explanation.deviation(found, process, model.doubts.suspect),
         "commands": model.commands,
         "stale": stale + not_current,
         "quality": dict(qualities(model.doubts, stale, process)),
@@ -332,12 +331,12 @@ def explanation_document(model: image.Model, number: int | None, at_tick: int | 
     before = updates[place - 1] if place else None
     after = updates[place + 1] if place + 1 < len(updates) else None
     try:
-        found = explain(update, before, after, model.rule, model.process)
+        found = explanation.explain(update, before, after, model.rule, model.process)
     except (ArithmeticError, ValueError):  # numbers that no optimiser of ours writes
         return None
     prediction = next((one for one in reversed(model.predictions) if one.update == update.update), None)
     document = asdict(found)
-    document["sentence"] = sentence(found, model.rule)
+    document["sentence"] = explanation.sentence(found, model.rule)
     document["update"] = update._asdict()
     document["before"] = found.before._asdict() if found.before is not None else None
     document["time_s"] = update.tick * model.process.tick_s
@@ -439,18 +438,18 @@ def _ranges(names: Sequence[str], low: Sequence[float], high: Sequence[float]) -
 
 def page_families(model: image.Model, browsers: int) -> Iterator[Metric]:
     """Yield everything; of a service that is silent only that it is."""
-    yield build_family()
+    yield monitoring.build_family()
     live = [service for service in model.maps if model.is_live(service)]
     up = {service: service in live for service in model.maps}
-    yield gauge("coldloop_up", "1 while a service answers the page", up, label="service")
+    yield monitoring.gauge("coldloop_up", "1 while a service answers the page", up, label="service")
     ages = {service: age for service in model.maps if (age := model.age_s(service)) is not None}
-    yield gauge("coldloop_age_seconds", "Time since the last answer of a service", ages, label="service")
-    yield gauge("coldloop_page_browsers", "Streams to browsers", browsers)
+    yield monitoring.gauge("coldloop_age_seconds", "Time since the last answer of a service", ages, label="service")
+    yield monitoring.gauge("coldloop_page_browsers", "Streams to browsers", browsers)
     for service in live:
         for block in model.maps[service].blocks:
             record = model.sources[service].records.get(block.name)
             if record is not None and block.writer is None:
-                yield from block_families(service, block, record)
+                yield from monitoring.block_families(service, block, record)
     found, places = qualities(model.doubts, model.stale_prefixes(), model.process), ("control_plc.process.y.", *RAW)
     read = [place for place in places if place.partition(".")[0] in live]
     names = [f"{place}{name}" for place in read for name in model.process.output_names]
@@ -460,18 +459,18 @@ def page_families(model: image.Model, browsers: int) -> Iterator[Metric]:
         concerned = [name for name in names if name == entry or (entry[-1] == "." and name.startswith(entry))]
         worst.update(dict.fromkeys(concerned, list(image.Quality).index(quality)))
     description = ", ".join(f"{number} {quality}" for number, quality in enumerate(image.Quality))
-    yield gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
+    yield monitoring.gauge("coldloop_quality", f"Quality of a value: {description}", worst, label="signal")
     if "control_plc" in live:
-        words, rows = [alarm_word(kind, model.process) for kind in range(len(model.alarms))], model.alarms
+        words, rows = [journal.alarm_word(kind, model.process) for kind in range(len(model.alarms))], model.alarms
         states = ", ".join(f"{state.value} {state.text}" for state in AlarmState)
         for name, description, values in (
             ("coldloop_alarm_active", "1 while the condition of an alarm holds", [row.active for row in rows]),
             ("coldloop_alarm_state", states, [row.state for row in rows]),
             ("coldloop_alarm_raised", "Times that an alarm was raised", [row.times for row in rows]),
         ):
-            yield gauge(name, description, dict(zip(words, values, strict=True)), label="alarm")
+            yield monitoring.gauge(name, description, dict(zip(words, values, strict=True)), label="alarm")
     if "optimizer_plc" in live and model.updates:
         fields = model.maps["optimizer_plc"].block_of(Optimization).fields
         for (name, field), value in zip(fields.items(), model.updates[-1], strict=True):
             unit = f" ({field.unit})" if field.unit else ""
-            yield gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)
+            yield monitoring.gauge(f"coldloop_update_{name}", f"Last update: {field.description}{unit}", value)

@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
-from coldloop.process.declaration import Process
-from coldloop.process.updating_periods import ComputingTimes
+from coldloop.process import declaration, updating_periods
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.optimizer_plc import ModelDeviation, Optimization, UpdatingRuleKind, UpdatingRuleStatus
 from coldloop.text import number_text
@@ -129,14 +128,16 @@ class Explanation:
 
 def explain(
     update: Optimization, before: Optimization | None, after: Optimization | None, rule: UpdatingRuleStatus,
-    process: Process,
+    process: declaration.Process,
 ) -> Explanation:  # fmt: skip
     """Explain the updating period that begins with `update`, recorded between two others."""
     tick_s = process.tick_s
     if before is not None and before.update + 1 != update.update:
         before = None
     branch = _branch(update, before, rule)
-    times = ComputingTimes(rule.slots, rule.preparation, rule.iteration, tick_s, process.ticks_per_sample)
+    times = updating_periods.ComputingTimes(
+        rule.slots, rule.preparation, rule.iteration, tick_s, process.ticks_per_sample
+    )
     n_before = times.iterations(times.period(before.q)) if before is not None else 0
     increments = increments_of(update, n_before) if branch in DECIDED and before is not None else None
     alternatives = []
@@ -219,7 +220,7 @@ def _why_not_played(update: Optimization, before: Optimization | None, rule: Upd
     return Branch.LATE
 
 
-def deviation(found: ModelDeviation, process: Process, suspects: int = 0) -> str:
+def deviation(found: ModelDeviation, process: declaration.Process, suspects: int = 0) -> str:
     """Return how the plant differs from its model, without the load, the most notable first; empty where it agrees.
 
     Last come the reading that is furthest from what is predicted, if it is surprising: the model, or its sensor, is

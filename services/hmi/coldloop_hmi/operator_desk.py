@@ -15,12 +15,10 @@ from aiohttp import web
 from coldloop.errors import LinkError, UsageError
 from coldloop.modbus.settings import Endpoint
 from coldloop.operating import commands, execution
-from coldloop.registers import common, plant
-from coldloop.registers.control_plc import LadderStatus, Mode, Operator, OperatorMode
+from coldloop.registers import common, control_plc, plant
 from coldloop.text import parsed_json, value_text
-from coldloop_hmi.documents import encoded
+from coldloop_hmi import documents, process_image
 from coldloop_hmi.guard import Guard, compressed_answer, cookie_name, refusal
-from coldloop_hmi.process_image import Model
 from coldloop_hmi.settings import HmiSection
 from coldloop_hmi.users import Audit, Users
 
@@ -43,9 +41,13 @@ async def read_premises(clients: execution.Clients, command: commands.Command) -
     found = {"session": str((await next(iter(clients.values())).read(common.Identity)).session)}
     match command:
         case commands.SetMode():
-            mode = (await clients["control_plc"].read(LadderStatus)).mode
-            found["operator's mode"] = OperatorMode.word_of((await clients["control_plc"].read(Operator)).mode)
-            found["active"] = Mode.word_of(Mode.MPC if mode == Mode.REST else mode)  # between two sequences
+            mode = (await clients["control_plc"].read(control_plc.LadderStatus)).mode
+            found["operator's mode"] = control_plc.OperatorMode.word_of(
+                (await clients["control_plc"].read(control_plc.Operator)).mode
+            )
+            found["active"] = control_plc.Mode.word_of(
+                control_plc.Mode.MPC if mode == control_plc.Mode.REST else mode
+            )  # between two sequences
         case commands.SetSetpoint():
             operator = await execution.check_manual(clients["control_plc"])
             found[f"setpoint of {command.input}"] = value_text(operator.u[command.place], command.unit)
@@ -111,7 +113,7 @@ class OperatorDesk:
     """
 
     def __init__(
-        self, endpoints: dict[str, Endpoint], model: Model, now: Callable[[], float], *, training: bool
+        self, endpoints: dict[str, Endpoint], model: process_image.Model, now: Callable[[], float], *, training: bool
     ) -> None:
         self._endpoints = endpoints
         self._model = model
@@ -279,7 +281,7 @@ class Commanding:
     async def audit(self, request: web.Request) -> web.Response:
         """Answer with the last entries of the audit, for operators."""
         self._operator(request)
-        return compressed_answer(request, encoded({"entries": self.log.entries[::-1]}))
+        return compressed_answer(request, documents.encoded({"entries": self.log.entries[::-1]}))
 
     async def prepare(self, request: web.Request) -> web.Response:
         """Take a command: answer with what it would do and the token that confirms it."""
@@ -306,7 +308,7 @@ class Commanding:
         self.log.note(  # by name: the login may have ended meanwhile
             "command", who=user, address=request.remote or "", outcome=word, detail=detail
         )
-        return compressed_answer(request, encoded(outcome._asdict()))
+        return compressed_answer(request, documents.encoded(outcome._asdict()))
 
     def _required_desk(self) -> OperatorDesk:
         if self.desk is None:

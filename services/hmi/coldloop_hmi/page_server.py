@@ -15,17 +15,13 @@ from aiohttp import BasicAuth, hdrs, web
 from aiohttp.log import server_logger
 
 from coldloop.errors import ConfigurationError, PortInUseError
-from coldloop.modbus.connection import RefusalLog
-from coldloop.modbus.tls import TlsListener
+from coldloop.modbus import connection, tls
 from coldloop.service.monitoring import CONTENT_TYPE, exposition
-from coldloop_hmi import documents
+from coldloop_hmi import documents, operator_desk, process_image, users
 from coldloop_hmi import guard as guards
 from coldloop_hmi.documents import encoded
 from coldloop_hmi.guard import Broadcast, Connections, Guard, LongReads, compressed_answer, refusal
-from coldloop_hmi.operator_desk import LONGEST_REQUEST, Commanding, OperatorDesk
-from coldloop_hmi.process_image import JournalEntry, Model
 from coldloop_hmi.settings import HmiSection
-from coldloop_hmi.users import Audit, Users
 
 Task = Callable[[], Coroutine[Any, Any, None]]
 POINTS: Final = 800
@@ -54,7 +50,9 @@ LINGERING_S: Final = 1.0
 class Reading:
     """Answers requests that only read; with `replay` the model shows a recorded run."""
 
-    def __init__(self, settings: HmiSection, model: Model, broadcast: Broadcast, guard: Guard, *, replay: bool) -> None:
+    def __init__(
+        self, settings: HmiSection, model: process_image.Model, broadcast: Broadcast, guard: Guard, *, replay: bool
+    ) -> None:
         self._settings = settings
         self._model = model
         self._broadcast = broadcast
@@ -201,7 +199,7 @@ class Reading:
         """Answer with all alarms."""
         return compressed_answer(request, encoded({"alarms": documents.alarms_document(self._model)}))
 
-    def _events(self, query: Mapping[str, str]) -> list[JournalEntry]:
+    def _events(self, query: Mapping[str, str]) -> list[process_image.JournalEntry]:
         """Return the events that a search finds, the newest first (HTTPBadRequest: its times are not numbers)."""
         wanted, service = query.get("search", "").lower(), query.get("service", "")
         try:
@@ -287,8 +285,8 @@ def printable(text: str) -> str:
 class PageSite(NamedTuple):
     """One rig, or one recorded run, and what can be done with it."""
 
-    model: Model
-    desk: OperatorDesk | None = None
+    model: process_image.Model
+    desk: operator_desk.OperatorDesk | None = None
     """Carries out commands; None where there are none."""
     routes: tuple[web.AbstractRouteDef, ...] = ()
     """Further requests that are served."""
@@ -303,13 +301,13 @@ class PageServer:
 
     def __init__(self, settings: HmiSection, *sites: PageSite) -> None:
         self._settings = settings
-        self._audit = Audit(settings.audit)
-        self._users = Users(settings.login.users)
+        self._audit = users.Audit(settings.audit)
+        self._users = users.Users(settings.login.users)
         self._connections = Connections(settings.connections, time.monotonic)
         self._guard = Guard(settings, self._audit, self._users, self._connections)
-        self._streams: list[tuple[Model, Broadcast, asyncio.Event]] = []
+        self._streams: list[tuple[process_image.Model, Broadcast, asyncio.Event]] = []
         server_logger.addFilter(guards.told_in_a_line)
-        app = web.Application(middlewares=[self._guard.middleware], client_max_size=LONGEST_REQUEST)
+        app = web.Application(middlewares=[self._guard.middleware], client_max_size=operator_desk.LONGEST_REQUEST)
         if len(sites) == 1:
             app.add_routes(self._routes(sites[0]))
         else:
@@ -322,7 +320,7 @@ class PageServer:
             app, access_log=None, shutdown_timeout=SHUTDOWN_S, keepalive_timeout=WAITING_S,
             lingering_time=LINGERING_S, auto_decompress=False,
         )  # fmt: skip
-        self._listener: asyncio.Server | TlsListener | None = None
+        self._listener: asyncio.Server | tls.TlsListener | None = None
         self.port = 0
 
     def _routes(self, site: PageSite) -> list[web.AbstractRouteDef]:
@@ -332,7 +330,7 @@ class PageServer:
         model.on_change = news.set
         self._streams.append((model, broadcast, news))
         reading = Reading(self._settings, model, broadcast, self._guard, replay=desk is None)
-        commanding = Commanding(self._settings, self._guard, self._users, desk, self._audit)
+        commanding = operator_desk.Commanding(self._settings, self._guard, self._users, desk, self._audit)
         return [*reading.routes(), *commanding.routes(), *extra]
 
     async def start(self) -> None:
@@ -350,9 +348,9 @@ class PageServer:
             if https is None:
                 self._listener = await asyncio.get_running_loop().create_server(newcomer, host, port)
             else:
-                self._listener = await TlsListener.at(
+                self._listener = await tls.TlsListener.at(
                     host, port, https, make_protocol=newcomer, limit=self._settings.connections,
-                    refusals=RefusalLog("hmi"),
+                    refusals=connection.RefusalLog("hmi"),
                 )  # fmt: skip
         except OSError as error:
             await self._runner.cleanup()
@@ -391,7 +389,7 @@ class PageServer:
         self._audit.close()
 
 
-async def _send_changes(model: Model, broadcast: Broadcast, news: asyncio.Event) -> None:
+async def _send_changes(model: process_image.Model, broadcast: Broadcast, news: asyncio.Event) -> None:
     sent = 0.0
     while True:
         with suppress(TimeoutError):

@@ -16,9 +16,8 @@ from typing import Any, Final, Generic, NamedTuple, TypeVar, cast
 
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
-from coldloop.registers import codec, common, declaration, maps_of, plant
+from coldloop.registers import codec, common, declaration, maps_of, optimizer_plc, plant
 from coldloop.registers.control_plc import LadderStatus, Mode, Plan, ProcessNow
-from coldloop.registers.optimizer_plc import OperatingLimits, Optimization, Prediction, UpdatingRuleStatus
 from coldloop.service.journal import EventText, describe, utc_text
 
 STATION_NAMES: Final = ("P12", "P11")
@@ -328,8 +327,8 @@ class Model:
         self.now = now
         self.sources = {service: Source() for service in self.maps}
         self.trends = TrendStore(process, kept_s)
-        self.updates: deque[Optimization] = deque(maxlen=UPDATES_KEPT)
-        self.predictions: deque[Prediction] = deque(maxlen=PREDICTIONS_KEPT)
+        self.updates: deque[optimizer_plc.Optimization] = deque(maxlen=UPDATES_KEPT)
+        self.predictions: deque[optimizer_plc.Prediction] = deque(maxlen=PREDICTIONS_KEPT)
         self.alarms: list[common.Alarm] = []
         self.events: deque[JournalEntry] = deque(maxlen=EVENTS_KEPT)
         self.events_told = 0
@@ -374,7 +373,7 @@ class Model:
             station = self.record("plant", plant.StationStatus)
             signals = station.signals if station else ()
             self.trends.add(record, self.mode, self.doubts, signals, is_after_gap=is_after_gap)
-        elif isinstance(record, Prediction):
+        elif isinstance(record, optimizer_plc.Prediction):
             if record.tick and (not self.predictions or self.predictions[-1].update != record.update):
                 self.predictions.append(record)
                 self.changed.add("prediction")
@@ -402,7 +401,7 @@ class Model:
             self.alarms = rows
             self.changed.add("alarms")
 
-    def put_updates(self, updates: Iterable[Optimization]) -> None:
+    def put_updates(self, updates: Iterable[optimizer_plc.Optimization]) -> None:
         """Take updates that are new, oldest first."""
         for update in updates:
             if self.updates and update.tick < self.updates[-1].tick:
@@ -454,14 +453,16 @@ class Model:
         return Doubts(suspect, held=ladder.bad_sensors if ladder else 0, simulated=self.faulty_sensors)
 
     @property
-    def rule(self) -> UpdatingRuleStatus:
+    def rule(self) -> optimizer_plc.UpdatingRuleStatus:
         """Rule that decides the updating period."""
-        return self.record("optimizer_plc", UpdatingRuleStatus) or UpdatingRuleStatus()
+        return self.record("optimizer_plc", optimizer_plc.UpdatingRuleStatus) or optimizer_plc.UpdatingRuleStatus()
 
     @property
-    def limits(self) -> OperatingLimits:
+    def limits(self) -> optimizer_plc.OperatingLimits:
         """Bands, bounds and rates."""
-        return self.record("optimizer_plc", OperatingLimits) or codec.blank(OperatingLimits, self.maps["optimizer_plc"])
+        return self.record("optimizer_plc", optimizer_plc.OperatingLimits) or codec.blank(
+            optimizer_plc.OperatingLimits, self.maps["optimizer_plc"]
+        )
 
     @property
     def tick(self) -> int:

@@ -20,15 +20,10 @@ from coldloop.errors import DamagedAnswerError, LinkError, RequestRefusedError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
 from coldloop.operating.observer import JournalReader, UpdateReader, read_alarms
-from coldloop.process.cold_box import STATION_VALVE_NAMES
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 from coldloop.registers import common, control_plc, optimizer_plc, plant
 from coldloop.registers.common import Alarm
-from coldloop_hmi.documents import KIND, REFRIGERATOR
-from coldloop_hmi.guard import refusal
-from coldloop_hmi.operator_desk import OperatorDesk
-from coldloop_hmi.page_server import PageServer, PageSite
-from coldloop_hmi.process_image import SOUND, Doubts, JournalEntry, Model, shown_blocks
+from coldloop_hmi import documents, guard, operator_desk, page_server, process_image
 from coldloop_hmi.settings import HmiSection, HmiSettings
 
 log = logging.getLogger("coldloop.hmi")
@@ -61,12 +56,12 @@ async def serve(settings: HmiSettings) -> None:
         PortInUseError: Another program listens there.
     """
     hmi = settings.hmi
-    model = Model(settings.process, time.monotonic, hmi.kept_s)
+    model = process_image.Model(settings.process, time.monotonic, hmi.kept_s)
     ends: dict[str, Endpoint] = {service: getattr(hmi, service) for service in model.maps}
     tls = {"tls": hmi.operator_tls} if hmi.operator_tls else {}
     operated = {service: end.model_copy(update=tls) for service, end in ends.items()}
-    desk = OperatorDesk(operated, model, time.monotonic, training=hmi.training)
-    server = PageServer(hmi, PageSite(model, desk))
+    desk = operator_desk.OperatorDesk(operated, model, time.monotonic, training=hmi.training)
+    server = page_server.PageServer(hmi, page_server.PageSite(model, desk))
     clients = {service: RegisterClient.at(model.maps[service], end) for service, end in ends.items()}
     pollers = [Poller(service, client, model, hmi.poll_s) for service, client in clients.items()]
     await server.serve(
@@ -78,7 +73,7 @@ async def serve(settings: HmiSettings) -> None:
 class Poller:
     """Reads one service into a model until cancelled, with `poll_s` between two looks."""
 
-    def __init__(self, service: str, client: RegisterClient, model: Model, poll_s: float) -> None:
+    def __init__(self, service: str, client: RegisterClient, model: process_image.Model, poll_s: float) -> None:
         self._service = service
         self._client = client
         self._model = model
@@ -86,7 +81,9 @@ class Poller:
         self._journal = JournalReader(client, queries=False, most=AT_ONCE)
         self._updates = UpdateReader(client, lambda update: model.put_updates([update]), most=AT_ONCE)
         frequent = (common.Identity, common.JournalPage, *FAST[service])
-        self._slow = [block.record for block in shown_blocks(model.maps[service]) if block.record not in frequent]
+        self._slow = [
+            block.record for block in process_image.shown_blocks(model.maps[service]) if block.record not in frequent
+        ]
         self._slow_at = 0.0
         self._alarms_at = 0.0
         self._checked = False
@@ -131,7 +128,7 @@ class Poller:
         model.put(service, identity)
         for record in FAST[service]:
             model.put(service, await client.read(record))
-        if service == "plant" and model.configuration.get(KIND) == REFRIGERATOR:
+        if service == "plant" and model.configuration.get(documents.KIND) == documents.REFRIGERATOR:
             model.put(service, await client.read(plant.StationStatus))
         if service == "optimizer_plc" and await self._updates.read(identity):
             model.put(service, await client.read(optimizer_plc.Prediction))
@@ -144,7 +141,7 @@ class Poller:
             await self._read_slow()
         events = await self._journal.read_on()
         model.put(service, self._journal.page)
-        model.put_events(JournalEntry.of(service, event, model.process) for event in events)
+        model.put_events(process_image.JournalEntry.of(service, event, model.process) for event in events)
 
     async def _read_slow(self) -> None:
         for record in self._slow:
@@ -176,7 +173,7 @@ class ReplayFrame(NamedTuple):
     cause: int
     since: int
     """Tick at which the mode began."""
-    doubts: Doubts = SOUND
+    doubts: process_image.Doubts = process_image.SOUND
     """Outputs whose readings were in doubt. The process has the true value."""
     station: plant.StationSample | None = None
     """Sample of the station of a whole refrigerator."""
@@ -186,11 +183,11 @@ class RecordedRun(Protocol):
     """Recorded run, as a replay needs it."""
 
     name: str
-    process: Process
+    process: declaration.Process
     ticks: int
     """Ticks that were recorded, from 0 on."""
     updates: Sequence[optimizer_plc.Optimization]
-    events: Sequence[JournalEntry]
+    events: Sequence[process_image.JournalEntry]
     """Events in the order of their ticks."""
     rule: optimizer_plc.UpdatingRuleStatus
     """Rule that decided the updating period."""
@@ -201,7 +198,7 @@ class RecordedRun(Protocol):
     def frame(self, tick: int) -> ReplayFrame | None:
         """Return one tick; None if it is missing in the recording."""
 
-    def alarms(self, events: Sequence[JournalEntry]) -> list[Alarm]:
+    def alarms(self, events: Sequence[process_image.JournalEntry]) -> list[Alarm]:
         """Return the alarms after these events, by number."""
 
 
@@ -216,7 +213,7 @@ class ReplayRequest(BaseModel, frozen=True, extra="forbid", allow_inf_nan=False)
 class Replay:
     """Plays a run into a model, whose trends have `kept_s` of it."""
 
-    def __init__(self, run: RecordedRun, model: Model, kept_s: float) -> None:
+    def __init__(self, run: RecordedRun, model: process_image.Model, kept_s: float) -> None:
         self._run = run
         self._model = model
         self._kept_ticks = round(kept_s / run.process.tick_s)
@@ -245,7 +242,7 @@ class Replay:
             wish = ReplayRequest.model_validate_json(await request.read())
         except ValidationError as error:
             first = error.errors()[0]
-            return refusal(422, f"{'.'.join(map(str, first['loc'])) or 'request'}: {first['msg']}")
+            return guard.refusal(422, f"{'.'.join(map(str, first['loc'])) or 'request'}: {first['msg']}")
         if wish.speed is not None:
             self._speed = wish.speed
         if wish.tick is not None:
@@ -308,7 +305,7 @@ class Replay:
             model.put("control_plc", newest.process)
             model.put("plant", plant.LoadStatus(watts=newest.process.load))
             if (one := newest.station) is not None:  # what its controller asked for is not recorded
-                unknown = (math.nan,) * len(STATION_VALVE_NAMES)
+                unknown = (math.nan,) * len(cold_box.STATION_VALVE_NAMES)
                 model.put("plant", plant.StationStatus(one.tick, one.mode, one.alarms, one.signals, unknown))
         model.put_updates(run.updates[_count(run.updates, before) : _count(run.updates, tick)])
         events = run.events[: _count(run.events, tick)]
@@ -326,7 +323,7 @@ class Replay:
         }  # fmt: skip
 
 
-def _count(rows: Sequence[optimizer_plc.Optimization] | Sequence[JournalEntry], tick: int) -> int:
+def _count(rows: Sequence[optimizer_plc.Optimization] | Sequence[process_image.JournalEntry], tick: int) -> int:
     """Return how many of these there are up to a tick."""
     return bisect_right(rows, tick, key=lambda row: row.tick)
 
@@ -338,7 +335,9 @@ async def serve_replays(runs: Sequence[RecordedRun], settings: HmiSection, annou
         PortInUseError: Another program listens there.
         ConfigurationError: A file of the settings cannot be used.
     """
-    models = [Model(run.process, time.monotonic, settings.kept_s) for run in runs]
+    models = [process_image.Model(run.process, time.monotonic, settings.kept_s) for run in runs]
     replays = [Replay(run, model, settings.kept_s) for run, model in zip(runs, models, strict=True)]
-    server = PageServer(settings, *(PageSite(m, None, r.routes()) for m, r in zip(models, replays, strict=True)))
+    server = page_server.PageServer(
+        settings, *(page_server.PageSite(m, None, r.routes()) for m, r in zip(models, replays, strict=True))
+    )
     await server.serve([replay.run for replay in replays], lambda: announce(server.address))

@@ -15,21 +15,20 @@ from typing import Annotated, Any, Self
 from pydantic import BaseModel, Field, PositiveFloat, field_validator, model_validator
 
 from coldloop.errors import ConfigurationError, foreign
-from coldloop.process.declaration import Process
+from coldloop.process import declaration, updating_periods
 from coldloop.process.settings import PositivePerInput, ProcessSettings, declared, settings_process, stretched, within
-from coldloop.process.updating_periods import ComputingTimes
 
 PENALTY_WEIGHT = 3000.0
 """alpha that all solvers are judged by with the default weights. In a program's settings it follows from `penalties`
 and `design.violation_weight` wherever it is not set."""
 
 
-def signals_of(process: Process) -> tuple[str, ...]:
+def signals_of(process: declaration.Process) -> tuple[str, ...]:
     """Return what may have a bias, in the order of their states: outputs, then inputs."""
     return (*process.output_names, *process.input_names)
 
 
-def groups_of(process: Process) -> dict[str, tuple[str, ...]]:
+def groups_of(process: declaration.Process) -> dict[str, tuple[str, ...]]:
     """Return what `estimator.disturbances` calls all outputs, or inputs, that may have a bias: not L1, nor the heater.
 
     No sensor of the cold box tells a bias of these from liquid helium, or from the load.
@@ -204,7 +203,7 @@ def _by_quantity(settings: ProcessSettings, what: str, numbers: Sequence[float])
     )
 
 
-def _members(names: tuple[str, ...], process: Process) -> list[str]:
+def _members(names: tuple[str, ...], process: declaration.Process) -> list[str]:
     return [member for name in names for member in groups_of(process).get(name, (name,))]
 
 
@@ -231,7 +230,7 @@ class PlcBudget:
         slots_s = settings.preparation_slots * (SLOT_S * process.share("preparation"))
         self.longest_ticks = process.ticks_per_sample
         """Longest updating period, a sampling period."""
-        self.times = ComputingTimes(
+        self.times = updating_periods.ComputingTimes(
             slots_s / settings.power, settings.preparation_s / settings.power, tau_1_s / settings.power,
             process.tick_s, self.longest_ticks,
         )  # fmt: skip

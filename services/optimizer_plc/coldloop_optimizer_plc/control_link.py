@@ -15,13 +15,10 @@ from typing import Final, TypeVar
 
 from coldloop import errors
 from coldloop.errors import BUSY, DamagedAnswerError, ModelFileError, RequestRefusedError
-from coldloop.modbus.client import RegisterClient
-from coldloop.modbus.requests import MAX_READ_WRITE_WORDS
+from coldloop.modbus import client, requests
 from coldloop.modbus.settings import Endpoint
+from coldloop.registers import common, declaration, optimizer_plc
 from coldloop.registers import control_plc as registers
-from coldloop.registers.common import EventKind, Identity, SessionPace
-from coldloop.registers.declaration import RegisterMap
-from coldloop.registers.optimizer_plc import ControlLinkState, ControlLinkStatus
 from coldloop.safety.writers import InputSequence
 from coldloop.service.journal import Journal
 from coldloop.session import TimeBase
@@ -38,7 +35,7 @@ DAMAGED_THERE: Final = (registers.Verdict.BAD_CRC, registers.Verdict.WRONG_LENGT
 LONGEST_WAIT_S: Final = 1.0
 """The control PLC answers a request that waits for an update after this real time at the latest."""
 
-_S = ControlLinkState
+_S = optimizer_plc.ControlLinkState
 _NEXT: Final = {
     _S.SEARCHING: {_S.INTRODUCING},
     _S.INTRODUCING: {_S.WAITING},
@@ -72,9 +69,9 @@ class ControlLink:
         self.was_up = False
         """The control PLC has been found, with our model, since the start."""
 
-    def registers(self) -> ControlLinkStatus:
+    def registers(self) -> optimizer_plc.ControlLinkStatus:
         """Return what the registers show."""
-        return ControlLinkStatus(self.state, self.holder, **self._counts)
+        return optimizer_plc.ControlLinkStatus(self.state, self.holder, **self._counts)
 
     def attempt(self, now: float) -> None:
         """An attempt to reach the control PLC begins at `now`, s."""
@@ -116,13 +113,13 @@ class ControlLink:
         self._logged_at[reason] = now
         return True
 
-    def go(self, state: ControlLinkState, **counts: int) -> None:
+    def go(self, state: optimizer_plc.ControlLinkState, **counts: int) -> None:
         """Go to a state that may follow, and add to counters: `rejected` sequences, computations `interrupted`."""
         if state not in _NEXT[self.state]:
             raise RuntimeError(f"the link does not go from {self.state.name} to {state.name}")
         self._set(state, **counts)
 
-    def _set(self, state: ControlLinkState, **counts: int) -> None:
+    def _set(self, state: optimizer_plc.ControlLinkState, **counts: int) -> None:
         """Change the state, add to counters, and note in the journal whether the link is up, or why it is not."""
         self.state = state
         for name, count in counts.items():
@@ -130,7 +127,7 @@ class ControlLink:
         shown = _S.WAITING if state in _UP else state
         if shown not in (self._noted, _S.INTRODUCING):
             self._noted = shown
-            self._journal.note(self.tick, EventKind.CONTROL_LINK, shown)
+            self._journal.note(self.tick, common.EventKind.CONTROL_LINK, shown)
             self._tell()
 
 
@@ -143,17 +140,22 @@ class ControlClient:
     """
 
     def __init__(
-        self, register_map: RegisterMap, endpoint: Endpoint, link: ControlLink, model_digest: int, model_name: str
+        self,
+        register_map: declaration.RegisterMap,
+        endpoint: Endpoint,
+        link: ControlLink,
+        model_digest: int,
+        model_name: str,
     ) -> None:
         self._map = register_map
         header, row = (
             register_map.block_of(record).row_words for record in (registers.SequenceHeader, registers.SequenceRow)
         )
-        self._rows_with_header = (MAX_READ_WRITE_WORDS - header) // row
+        self._rows_with_header = (requests.MAX_READ_WRITE_WORDS - header) // row
         """Rows that fit into one request with the header that commits them: 18 of three inputs."""
         self._endpoint, self._link = endpoint, link
         self._model_digest, self._model_name = model_digest, model_name
-        self._client = RegisterClient.at(self._map, endpoint)
+        self._client = client.RegisterClient.at(self._map, endpoint)
         self._beats = 0
 
     def close(self) -> None:
@@ -164,23 +166,25 @@ class ControlClient:
         """Start over with the present files for TLS, which may be new ones; ConfigurationError: they cannot be used."""
         if self._endpoint.tls is not None:
             self._client.close()
-            self._client = RegisterClient.at(self._map, self._endpoint)
+            self._client = client.RegisterClient.at(self._map, self._endpoint)
 
     async def introduce(self) -> None:
         """Connect, send our number and our model's digest; ModelFileError: the control PLC has another model."""
         await self._client.connect(0.0)
         self._link.answered()
-        if self._link.state is ControlLinkState.WRONG_MODEL:  # a heartbeat would keep the right optimiser out
+        if (
+            self._link.state is optimizer_plc.ControlLinkState.WRONG_MODEL
+        ):  # a heartbeat would keep the right optimiser out
             await self._check_model()
         await self._beat()
         await self._check_model()
         self._link.introduced()
 
     async def _check_model(self) -> None:
-        theirs = (await self._client.read(Identity)).model_digest
+        theirs = (await self._client.read(common.Identity)).model_digest
         if theirs == self._model_digest:
             return
-        if (await self._client.read(Identity)).model_digest != theirs:  # this block is not sealed
+        if (await self._client.read(common.Identity)).model_digest != theirs:  # this block is not sealed
             raise DamagedAnswerError(f"{self._client.peer}: its identity arrived damaged")
         raise ModelFileError(
             f"{self._client.peer} runs model {theirs:08x}, this optimiser {self._model_digest:08x} "
@@ -194,8 +198,8 @@ class ControlClient:
     async def pace(self, session: int) -> TimeBase | None:
         """Return the time base of a session; None where the control PLC is in another, or shows none that can be."""
 
-        async def twice() -> SessionPace:  # this block is not sealed, and what it says is not asked for again
-            one, other = await self._client.read(SessionPace), await self._client.read(SessionPace)
+        async def twice() -> common.SessionPace:  # this block is not sealed, and what it says is not asked for again
+            one, other = await self._client.read(common.SessionPace), await self._client.read(common.SessionPace)
             if one != other:
                 raise DamagedAnswerError(f"{self._client.peer}: its pace arrived damaged")
             return one

@@ -11,21 +11,17 @@ from typing import Any
 import numpy as np
 
 from coldloop.errors import ConfigurationError
-from coldloop.kernels.cache import kernels_of
-from coldloop.kernels.compiled import entry_of, python_of
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import LtiModel
+from coldloop.kernels import cache, compiled
+from coldloop.process import declaration, lti_model
 from coldloop.process.settings import InputLimits
+from coldloop.registers import control_plc
 from coldloop.registers import optimizer_plc as registers
-from coldloop.registers.control_plc import Plan, SequenceHeader, Update, Verdict
 from coldloop.safety.writers import InputSequence, with_checksum
-from coldloop_optimizer_plc import decisions, scheme
-from coldloop_optimizer_plc.computing_settings import Arithmetic, Part, PlcBudget, in_its_name
+from coldloop_optimizer_plc import computing_settings, decisions, scheme
 from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.estimator import OutsideEstimator, correct, estimator_of
-from coldloop_optimizer_plc.qp.linear_algebra import Array, real_of
+from coldloop_optimizer_plc.qp import linear_algebra, problem
 from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map, target_search
-from coldloop_optimizer_plc.qp.problem import PredictiveProblem, QpParameters
 from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, make_rule
 from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
@@ -33,7 +29,7 @@ from coldloop_optimizer_plc.solvers import KernelSolver, make_solver
 
 
 @np.errstate(over="ignore")
-def _single(values: Sequence[float] | Array) -> list[float]:
+def _single(values: Sequence[float] | linear_algebra.Array) -> list[float]:
     """Return numbers as registers carry them: infinite beyond single precision."""
     single: list[float] = np.asarray(values, np.float64).astype(np.float32).tolist()
     return single
@@ -42,22 +38,24 @@ def _single(values: Sequence[float] | Array) -> list[float]:
 class OptimizerProgram:
     """Estimator, problem, solver and updating rule, put together."""
 
-    def __init__(self, model: LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
-        precision = " in single precision" * (settings.arithmetic is Arithmetic.FLOAT32)
-        with kernels_of(f"the {settings.solver_name} solver{precision}", about_s=15):
+    def __init__(self, model: lti_model.LtiModel, settings: ProgramSettings, limits: InputLimits) -> None:
+        precision = " in single precision" * (settings.arithmetic is computing_settings.Arithmetic.FLOAT32)
+        with cache.kernels_of(f"the {settings.solver_name} solver{precision}", about_s=15):
             self.settings, self.process = settings, settings.process
             self.model_digest = model.short_digest
-            self._real = real_of(settings.arithmetic)
+            self._real = linear_algebra.real_of(settings.arithmetic)
             self.disturbances = settings.estimator.disturbed
             self._prediction = prediction = prediction_of(model, self.disturbances, settings.design)
             self._forecasts = Forecasts(self.process, settings.design.decision_instants)
-            self.problem = PredictiveProblem(prediction, settings.design, limits, self._real, settings.penalties)
+            self.problem = problem.PredictiveProblem(
+                prediction, settings.design, limits, self._real, settings.penalties
+            )
             self.solver = make_solver(settings)
-            self.budget = PlcBudget(settings.budget, self.solver.tau_1_s)
+            self.budget = computing_settings.PlcBudget(settings.budget, self.solver.tau_1_s)
             self.state = empty_state(prediction.n_states, len(model.u0), len(model.y0), self.problem.size, self._real)
             estimator = estimator_of(prediction, settings.estimator, self._real, settings.plausibility)
             self._nothing_ahead = np.zeros(0, self._real)
-            at_rest = self.problem.at(QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
+            at_rest = self.problem.at(problem.QpParameters(self.state.belief.x, self._real(0.0), self.state.u))
             self.method = self.solver.method(at_rest) if isinstance(self.solver, KernelSolver) else None
             target = target_search(prediction, settings.design, limits, self._real)
             self.constants = scheme.constants_of(
@@ -67,10 +65,10 @@ class OptimizerProgram:
             self._compile_kernels(model)
         self.restart(settings.updating_period_s)
 
-    def _compile_kernels(self, model: LtiModel) -> None:
+    def _compile_kernels(self, model: lti_model.LtiModel) -> None:
         """Go through two updates at the operating point, so that no session waits for the compiler."""
         u, y, x = (tuple(values.tolist()) for values in (model.u0, model.y0, model.x0))
-        first = Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x)
+        first = control_plc.Update(0, 0, 0, 0, load=model.w0, u_before=u, u=u, y=y, x=x)
         self.restart(0.0)
         planned = self.plan(first)
         sequence = self.solve()
@@ -106,10 +104,10 @@ class OptimizerProgram:
         """Call a kernel whose arguments have the same types in the whole session."""
         entry = self._entries.get(kernel)
         if entry is None:
-            entry = self._entries[kernel] = entry_of(kernel, *arguments)
+            entry = self._entries[kernel] = compiled.entry_of(kernel, *arguments)
         return entry(*arguments)
 
-    def plan(self, update: Update) -> Plan:
+    def plan(self, update: control_plc.Update) -> control_plc.Plan:
         """Take the update latched at t_i and decide the updating period that begins there."""
         c, m = self.constants, self.state
         u_before, u, y, x = (np.array(values, self._real) for values in (update.u_before, update.u, update.y, update.x))
@@ -121,12 +119,12 @@ class OptimizerProgram:
             starts = Starts(self.rule.first, self.rule.after_interruption())
             load_step = self._run(decisions.take_update, c, self.rule, starts, m, latched)
         now = self.state.numbers[0]
-        return Plan(
+        return control_plc.Plan(
             update.update, update.tick + int(now["ticks"]), float(load_step), float(now["shortage"]),
             int(now["suspects"]),
         )  # fmt: skip
 
-    def _ahead(self, tick: int) -> Array:
+    def _ahead(self, tick: int) -> linear_algebra.Array:
         return self._forecasts.changes(tick).astype(self._real) if len(self._forecasts) else self._nothing_ahead
 
     @property
@@ -146,7 +144,7 @@ class OptimizerProgram:
             correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
         else:
             self._estimator.correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y)
-        (python_of(decisions.begin_period) or decisions.begin_period)(c, self.rule, m, wanted, latched)
+        (compiled.python_of(decisions.begin_period) or decisions.begin_period)(c, self.rule, m, wanted, latched)
         return load_step
 
     def answer_after_s(self) -> float:
@@ -171,13 +169,15 @@ class OptimizerProgram:
             self._run(scheme.solve, self.constants, self.method, self.state)
         else:
             qp, guess = scheme.pose(self.constants, self.state)
-            with in_its_name(Part.SOLVER, self.settings.outside.solver or self.settings.solver):
+            with computing_settings.in_its_name(
+                computing_settings.Part.SOLVER, self.settings.outside.solver or self.settings.solver
+            ):
                 answer = self.solver.solve(qp, guess, (n - 1, n))
             scheme.deliver(self.constants, self.state, qp, answer)
         sent, rows = self.state.sent.numbers[0], self.state.sent.rows
         length, held = int(sent["length"]), self.process.ticks_per_sample
         inputs = list(map(tuple, rows[:length:held].tolist()))
-        header = SequenceHeader(
+        header = control_plc.SequenceHeader(
             number=int(sent["number"]), update=int(now["update"]), first_tick=int(sent["first_tick"]), length=length,
             tau_u=int(now["ticks"]), model_digest=self.model_digest, crc=0,
         )  # fmt: skip
@@ -193,7 +193,7 @@ class OptimizerProgram:
         if not header["length"]:
             raise RuntimeError("call solve before predictor")
         update, first_tick, z = int(self.state.numbers[0]["update"]), int(header["first_tick"]), sent.z.copy()
-        at = QpParameters(sent.x.copy(), header["w"], sent.u_before.copy())
+        at = problem.QpParameters(sent.x.copy(), header["w"], sent.u_before.copy())
 
         def predict() -> registers.Prediction:
             horizon = self.problem.design.horizon
@@ -227,7 +227,7 @@ class OptimizerProgram:
         times = self.budget.times
         return self.rule.status._replace(slots=times.slots, preparation=times.preparation, iteration=times.iteration)
 
-    def report(self, verdict: Verdict) -> registers.Optimization:
+    def report(self, verdict: control_plc.Verdict) -> registers.Optimization:
         """Return what was done with the last update, once the control PLC has answered."""
         if not (self.state.sent.numbers[0]["length"] or self.state.numbers[0]["solved"]):
             raise RuntimeError("call solve before report")
@@ -252,7 +252,7 @@ class Forecasts:
     Last samples of the parts of the horizon are its `ends`, rising.
     """
 
-    def __init__(self, process: Process, ends: Sequence[int]) -> None:
+    def __init__(self, process: declaration.Process, ends: Sequence[int]) -> None:
         self._edges = process.ticks_per_sample * np.array([0, *ends])
         self._courses = []
         for one in process.forecasts:
@@ -263,7 +263,7 @@ class Forecasts:
     def __len__(self) -> int:
         return len(self._courses) * (len(self._edges) - 1)
 
-    def changes(self, tick: int) -> Array:
+    def changes(self, tick: int) -> linear_algebra.Array:
         """Return for each forecast its mean over each part of a horizon that begins at `tick`, less what it is there.
 
         Shape (forecasts x parts,), in the units of the disturbances.

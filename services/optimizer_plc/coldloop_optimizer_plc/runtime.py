@@ -10,8 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Final, NamedTuple, TypeAlias
 
-from coldloop import __version__, errors
-from coldloop.config import selected
+from coldloop import __version__, config, errors
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.lti_model import LtiModel, load
 from coldloop.process.settings import InputLimits
@@ -189,7 +188,7 @@ class OptimizerPlc:
             maps.optimizer_plc, section.word_order, self._program.budget, self._program.operating_limits, digest, holder
         )
         self.publication.bank.keep_fresh(registers.ModelDeviation, self._program.model_deviation)
-        common.publish_configuration(self.publication.bank, selected(settings, SHOWN))
+        common.publish_configuration(self.publication.bank, config.selected(settings, SHOWN))
         self._link = self.publication.link
         self._control = ControlClient(
             maps.control_plc, section.control_plc, self._link, digest, str(settings.model.file)

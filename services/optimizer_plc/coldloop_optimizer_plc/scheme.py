@@ -13,14 +13,13 @@ from numpy.typing import NDArray
 from coldloop.kernels.compiled import kernel
 from coldloop.process.declaration import Process
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop_optimizer_plc.computing_settings import PlcBudget
+from coldloop_optimizer_plc import computing_settings, rules
 from coldloop_optimizer_plc.estimator import Belief, Estimator, begin_prediction, no_belief, predict
 from coldloop_optimizer_plc.plausibility import are_finite
+from coldloop_optimizer_plc.qp import prediction
 from coldloop_optimizer_plc.qp import problem as problems
 from coldloop_optimizer_plc.qp.costs import predicted_indicators
 from coldloop_optimizer_plc.qp.linear_algebra import Array, Real, rounded
-from coldloop_optimizer_plc.qp.prediction import TargetSearch
-from coldloop_optimizer_plc.rules import MEMORY
 from coldloop_optimizer_plc.settings import ProgramSettings, RuleName
 from coldloop_optimizer_plc.solvers.interface import Answer, Costs, solve_by
 
@@ -134,7 +133,7 @@ def empty_state(n_states: int, n_inputs: int, n_outputs: int, size: int, real: R
 
     return OptimizerState(
         numbers(PERIOD), no_belief(n_states, n_outputs, real), delivery(), delivery(), np.zeros(n_inputs, real),
-        np.zeros(n_inputs, real), np.zeros(MEMORY, real),
+        np.zeros(n_inputs, real), np.zeros(rules.MEMORY, real),
     )  # fmt: skip
 
 
@@ -145,7 +144,7 @@ class Constants(NamedTuple):
     """Constants of an optimiser in one session, in the on-line floating-point type; loads are deviations, W."""
 
     estimator: Estimator
-    target: TargetSearch
+    target: prediction.TargetSearch
     Phi: Array
     Gamma: Array
     maps: problems.Maps
@@ -187,8 +186,8 @@ class Constants(NamedTuple):
 
 
 def constants_of(
-    estimator: Estimator, problem: problems.PredictiveProblem, target: TargetSearch, alpha: float,
-    settings: ProgramSettings, budget: PlcBudget, rest: Array,
+    estimator: Estimator, problem: problems.PredictiveProblem, target: prediction.TargetSearch, alpha: float,
+    settings: ProgramSettings, budget: computing_settings.PlcBudget, rest: Array,
 ) -> Constants:  # fmt: skip
     """Return the constants of a session with adaptive periods."""
     process, every, end = settings.process, range(budget.longest_ticks + 1), settings.cold_end
@@ -214,7 +213,7 @@ def constants_of(
     return rounded(found, problem.Phi.dtype.type)
 
 
-def shortest_sequence(settings: ProgramSettings, budget: PlcBudget) -> int:
+def shortest_sequence(settings: ProgramSettings, budget: computing_settings.PlcBudget) -> int:
     """Return the rows that a sequence has at least, so that it lasts until the next one can arrive.
 
     All sequences last for two updating periods. Where the rule may choose one more than twice as long as the one

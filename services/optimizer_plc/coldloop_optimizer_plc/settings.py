@@ -16,19 +16,16 @@ from pydantic import AfterValidator, BaseModel, Field, FiniteFloat, PositiveFloa
 
 from coldloop.config import as_toml, flattened
 from coldloop.modbus.settings import CONTROL_PORT, OPTIMIZER_PORT, Endpoint, ServerSettings
+from coldloop.process import cold_box, declaration, sections, updating_periods
 from coldloop.process import settings as per
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
-from coldloop.process.sections import FURTHEST_WEIGHT, rising_instants
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, settings_process, stretched
-from coldloop.process.updating_periods import SHORTEST_TICKS, TOLERANCE, whole_ticks
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
 from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_optimizer_plc import computing_settings as computing
 
-Instants = Annotated[tuple[int, ...], AfterValidator(rising_instants)]
+Instants = Annotated[tuple[int, ...], AfterValidator(sections.rising_instants)]
 FURTHEST_SCALE: Final = 100.0
 """Largest factor between a scale and the process's own. With scales of inputs that are 1e-3 of it the first step of the
 ODE-based solver is so short that the inputs of the cold box hardly move."""
@@ -101,7 +98,7 @@ class ControlDesign(ProcessSettings):
     @classmethod
     def _near_the_process(cls, value: Numbers, info: ValidationInfo) -> Numbers:
         name = str(info.field_name)
-        furthest = FURTHEST_SCALE if name in SCALES else FURTHEST_WEIGHT
+        furthest = FURTHEST_SCALE if name in SCALES else sections.FURTHEST_WEIGHT
         for own, given in zip(
             _numbers(cls.model_fields[name].get_default(call_default_factory=True)), _numbers(value), strict=True
         ):
@@ -197,7 +194,7 @@ UNMEASURED: Final = "unmeasured"
 """Key that section `estimator` of a process's preset `tuned` has instead where the load is not measured."""
 
 
-def presets_of(process: Process) -> Mapping[Preset, Mapping[str, Mapping[str, Any]]]:
+def presets_of(process: declaration.Process) -> Mapping[Preset, Mapping[str, Mapping[str, Any]]]:
     """Return the settings of each preset for a process, by section of `optimizer_plc.program`."""
     return {
         Preset.TUNED: {name: values for name, values in process.tuned.items() if name != UNMEASURED}
@@ -212,7 +209,10 @@ def presets_of(process: Process) -> Mapping[Preset, Mapping[str, Mapping[str, An
 
 
 OF_PRESETS: Final = tuple(
-    f"{name}.{key}" for preset in presets_of(COLD_BOX).values() for name, values in preset.items() for key in values
+    f"{name}.{key}"
+    for preset in presets_of(cold_box.COLD_BOX).values()
+    for name, values in preset.items()
+    for key in values
 )
 """Keys of `optimizer_plc.program` that a preset decides: the cold box's has all."""
 OF_ALPHA: Final = ("penalties.output_rows", "design.violation_weight")
@@ -370,8 +370,10 @@ class ProgramSettings(ProcessSettings, validate_default=True):
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
         tick_s = settings_process().tick_s
-        if whole_ticks(value, tick_s) is None or 0 < value < SHORTEST_TICKS * tick_s * (1.0 - TOLERANCE):
-            shortest = f"{SHORTEST_TICKS * tick_s:g} s"
+        if updating_periods.whole_ticks(
+            value, tick_s
+        ) is None or 0 < value < updating_periods.SHORTEST_TICKS * tick_s * (1.0 - updating_periods.TOLERANCE):
+            shortest = f"{updating_periods.SHORTEST_TICKS * tick_s:g} s"
             raise ValueError(f"an updating period is a multiple of {tick_s:g} s from {shortest} on, or 0 for adaptive")
         return value
 
@@ -420,7 +422,7 @@ class ProgramSettings(ProcessSettings, validate_default=True):
                 if isinstance(number, float) and not (number == 0.0 or 1.0 / LARGEST <= abs(number) <= largest):
                     raise ValueError(f"{key} = {number:g}: give 0 or a size from {1.0 / LARGEST:g} to {LARGEST:g}: "
                                      "single precision holds its square")  # fmt: skip
-        most = FURTHEST_WEIGHT * alpha_of(PenaltySettings(), ControlDesign())
+        most = sections.FURTHEST_WEIGHT * alpha_of(PenaltySettings(), ControlDesign())
         for key in ALPHAS:
             alpha = getattr(self, key.partition(".")[0]).alpha
             if alpha > most:

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple, Self
 
 import numpy as np
 
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import LtiModel, discretise
+from coldloop.process import declaration, lti_model
 from coldloop_plant.numeric import Array, RealArray
 
 COMPLEX_STEP = 1e-30  # in sizes of the variables
@@ -132,16 +131,16 @@ class Modes(NamedTuple):
 
 
 def model_of(
-    linear: Linear, x0: RealArray, u0: RealArray, w0: float, y0: RealArray, declared: Process,
+    linear: Linear, x0: RealArray, u0: RealArray, w0: float, y0: RealArray, declared: declaration.Process,
     states: Mapping[str, str], digest: str, **described: Any,  # noqa: ANN401 as the fields are
-) -> LtiModel:  # fmt: skip
+) -> lti_model.LtiModel:  # fmt: skip
     """Return the model file of a linear model at a point, for one load and a tick of its process.
 
     F and G of the linear model have one dimension. `states` are names and units, `digest` is that of what the model is
     made from, `described` are further fields of `LtiModel`.
     """
-    tick = discretise(linear.A, linear.B, linear.F, declared.tick_s)
-    return LtiModel(
+    tick = lti_model.discretise(linear.A, linear.B, linear.F, declared.tick_s)
+    return lti_model.LtiModel(
         **linear._asdict(), A_tick=tick.A, B_tick=tick.B, F_tick=tick.F, x0=x0, u0=u0, w0=w0, y0=y0,
         state_names=tuple(states), state_units=tuple(states.values()),
         input_names=declared.input_names, input_units=declared.input_units,

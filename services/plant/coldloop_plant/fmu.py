@@ -22,8 +22,7 @@ import numpy as np
 
 from coldloop.errors import ColdloopError, ModelFileError, foreign
 from coldloop.process.declaration import Process
-from coldloop_plant.numeric import RealArray
-from coldloop_plant.own_plants import NO_DISTURBANCES, Disturbances, DisturbedPlant
+from coldloop_plant import numeric, own_plants
 
 log = logging.getLogger("coldloop.plant")
 
@@ -209,7 +208,7 @@ class FmuSimulation:
         with foreign(f"{self._fmu.path}: {what}", said=self._said):
             yield
 
-    def put(self, u: RealArray, w: RealArray) -> None:
+    def put(self, u: numeric.RealArray, w: numeric.RealArray) -> None:
         """Set inputs, load (which may be none) and other disturbances, to the nearest value that each can have."""
         with self._calling("does not take its inputs"):
             self._set(self.inputs, [*u.tolist(), *w[0 if self._wiring.load else 1 :].tolist()])
@@ -224,7 +223,7 @@ class FmuSimulation:
         for kind, alike in wholes.items():
             getattr(self._slave, f"set{kind}")(list(alike), [value for whole in alike.values() for value in whole])
 
-    def read(self, ports: Sequence[Port]) -> RealArray:
+    def read(self, ports: Sequence[Port]) -> numeric.RealArray:
         """Return variables."""
         found = np.empty(len(ports))
         with self._calling("does not give its variables"):
@@ -255,13 +254,13 @@ class FmuSimulation:
                 raise ColdloopError(f"{self._fmu.path}: has ended its simulation at {time_s:g} s")
             self._steps += 1
 
-    def rest(self, u: RealArray, w: RealArray) -> None:
+    def rest(self, u: numeric.RealArray, w: numeric.RealArray) -> None:
         """Go to rest with inputs and disturbances, for as many ticks as that was found to take."""
         self.put(u, w)
         for _ in range(self._wiring.rest_ticks):
             self.tick()
 
-    def derivatives(self, of: Sequence[Port]) -> RealArray:
+    def derivatives(self, of: Sequence[Port]) -> numeric.RealArray:
         """Return partial derivatives by states, inputs, load and k other disturbances, shape (of, n + m + 1 + k)."""
         unknown = [port.reference for port in of]
         by = [*self.states, *self.inputs]
@@ -288,12 +287,12 @@ class FmuSimulation:
         self._steps = int(saved["steps"])
 
 
-class FmuPlant(DisturbedPlant):
+class FmuPlant(own_plants.DisturbedPlant):
     """An FMU as the plant, at rest at its operating point at tick 0; whether it can return to a state is known."""
 
     def __init__(
         self, simulation: FmuSimulation, *, keeps_state: bool, process: Process,
-        disturbances: Disturbances = NO_DISTURBANCES, **arguments: Any,  # noqa: ANN401 of the base
+        disturbances: own_plants.Disturbances = own_plants.NO_DISTURBANCES, **arguments: Any,  # noqa: ANN401 of the base
     ) -> None:  # fmt: skip
         self._simulation = simulation
         self._keeps_state = keeps_state
@@ -301,7 +300,7 @@ class FmuPlant(DisturbedPlant):
         x0 = np.append(self._shown(), disturbances.at(0))
         super().__init__(disturbances=disturbances, x0=x0.tolist(), process=process, **arguments)
 
-    def _shown(self) -> RealArray:
+    def _shown(self) -> numeric.RealArray:
         """Return the states; zeros where the FMU hides them."""
         states = self._simulation.read(self._simulation.states)
         return states if len(states) else self._hidden
@@ -309,11 +308,11 @@ class FmuPlant(DisturbedPlant):
     def _warm_up(self) -> None:
         """Do nothing: a tick would move it."""
 
-    def _own_outputs(self, w: RealArray) -> RealArray:
+    def _own_outputs(self, w: numeric.RealArray) -> numeric.RealArray:
         self._simulation.put(self._u, w)
         return self._simulation.read(self._simulation.outputs)
 
-    def _own_step(self, w: RealArray) -> tuple[RealArray, RealArray]:
+    def _own_step(self, w: numeric.RealArray) -> tuple[numeric.RealArray, numeric.RealArray]:
         self._simulation.put(self._u, w)
         self._simulation.tick()
         return self._shown(), self._simulation.read(self._simulation.outputs)

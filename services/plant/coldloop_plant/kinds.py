@@ -16,9 +16,8 @@ from coldloop.kernels.cache import kernels_of
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
 from coldloop.process.lti_model import COLD_BOX, LtiModel, ModelHeader, read_header
 from coldloop.process.settings import InputLimits
-from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, MismatchedPlant
+from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, MismatchedPlant, plant_file
 from coldloop_plant.cold_box.model import AtRest, parameters_digest
-from coldloop_plant.cold_box.plant_file import LISTING, BoxParameters, PlantFile
 from coldloop_plant.components.expansion import Valve
 from coldloop_plant.helium import load_helium
 from coldloop_plant.program import HeatLoad, MakePlant, MeasurementNoise, NoiseOfSeed, PlantProgram
@@ -26,7 +25,7 @@ from coldloop_plant.settings import MismatchSettings, PlantKind, PlantSection, S
 
 GROUP: Final = "coldloop.plant_kinds"
 """Group of entry points: classes of `Kind`, by the names of kinds in `plant.kind` and in model files."""
-P = TypeVar("P", bound=BoxParameters)
+P = TypeVar("P", bound=plant_file.BoxParameters)
 
 
 class Kind(Protocol):
@@ -41,13 +40,13 @@ class Kind(Protocol):
     def maker_of(self, header: ModelHeader, section: PlantSection, noise_of_seed: NoiseOfSeed) -> MakePlant:
         """Return what makes the plant of a model file, or around its reference cold box (`ColdloopError`)."""
 
-    def read_plant_file(self, path: Path | None, limits: InputLimits, *, whole: bool) -> PlantFile:
+    def read_plant_file(self, path: Path | None, limits: InputLimits, *, whole: bool) -> plant_file.PlantFile:
         """Return what a plant file says: of this kind if it has one of its sections, or if `whole` is set.
 
         It is the reference plant without a file; `limits` are those of the inputs (`ConfigurationError`).
         """
 
-    def at_rest(self, file: PlantFile, control: StationSettings) -> AtRest:
+    def at_rest(self, file: plant_file.PlantFile, control: StationSettings) -> AtRest:
         """Return the plant of a file of this kind at rest (`NoEquilibriumError`)."""
 
 
@@ -96,7 +95,7 @@ def box_of(model: ModelHeader | LtiModel, where: str = "model.file") -> ColdBox:
         ModelFileError: A parameter is unknown or out of range.
     """
     if model.plant == COLD_BOX:
-        return parameters_in(model, BoxParameters, where).box
+        return parameters_in(model, plant_file.BoxParameters, where).box
     return kind_named(model.plant, where).plant_in(model, where)[0]
 
 
@@ -105,7 +104,7 @@ def parameters_in(model: ModelHeader | LtiModel, kind: type[P], where: str) -> P
     try:
         return kind.model_validate(model.plant_parameters)
     except ValidationError as error:
-        wrong = explained(error, {}, kind, LISTING)
+        wrong = explained(error, {}, kind, plant_file.LISTING)
         raise ModelFileError(f"{where}: plant_parameters: {wrong}; make it with `coldloop model --plant`") from None
 
 

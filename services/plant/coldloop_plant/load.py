@@ -15,12 +15,10 @@ from pathlib import Path
 from typing import Final, NamedTuple
 
 from coldloop.errors import LoadFileError
-from coldloop.process.declaration import REFERENCE_TICK_S, Process
-from coldloop.process.load_profile import LoadProfile, read_load_file
-from coldloop.process.sections import Load
+from coldloop.process import declaration, load_profile, sections
 from coldloop.registers.plant import LOAD_ROWS, LoadStatus, LoadStep
 
-SECOND_TICKS: Final = round(1.0 / REFERENCE_TICK_S)
+SECOND_TICKS: Final = round(1.0 / declaration.REFERENCE_TICK_S)
 """Ticks of what is a second in the families below, of a process that is not stretched."""
 HOUR_TICKS: Final = 3600 * SECOND_TICKS
 LARGEST_STEP: Final = 200.0  # Largest load step of the six families, W
@@ -64,7 +62,7 @@ NAMED: Final = {
 DRAW_SEEDS: Final = 1000  # Between the seed of a family's draw and that of the next
 
 
-def telegraph(family: LoadFamily, mean_w: float) -> LoadProfile:
+def telegraph(family: LoadFamily, mean_w: float) -> load_profile.LoadProfile:
     """Return one hour of a family about `mean_w`, in whole ticks, starting at the mean."""
     draw = random.Random(family.seed).random  # noqa: S311 not for secrets; the one generator stable over versions
     times, watts = [0], [mean_w]
@@ -82,17 +80,17 @@ def telegraph(family: LoadFamily, mean_w: float) -> LoadProfile:
             times.append(tick)
             watts.append(mean_w + step)
         tick += round(lasting * SECOND_TICKS)
-    return LoadProfile(tuple(times), tuple(watts))
+    return load_profile.LoadProfile(tuple(times), tuple(watts))
 
 
-def concatenated(hours: list[LoadProfile]) -> LoadProfile:
+def concatenated(hours: list[load_profile.LoadProfile]) -> load_profile.LoadProfile:
     """Return one-hour profiles one after the other."""
     steps: list[tuple[int, float]] = []
     for hour, profile in enumerate(hours):
         for time, load in zip(profile.times, profile.watts, strict=True):
             if not steps or load != steps[-1][1]:
                 steps.append((hour * HOUR_TICKS + time, load))
-    return LoadProfile(*zip(*steps, strict=True))
+    return load_profile.LoadProfile(*zip(*steps, strict=True))
 
 
 def named_families(name: str) -> list[LoadFamily] | None:
@@ -110,7 +108,7 @@ def named_families(name: str) -> list[LoadFamily] | None:
     return [HOURS[hour]._replace(seed=HOURS[hour].seed + seeds) for hour in NAMED[base]]
 
 
-def drawn(family: LoadFamily, name: str, mean: float, process: Process) -> LoadProfile:
+def drawn(family: LoadFamily, name: str, mean: float, process: declaration.Process) -> load_profile.LoadProfile:
     """Return an hour of a family about the mean load of a process.
 
     Of one without named loads the largest step is the way from the mean to the nearer end of the load's span.
@@ -127,7 +125,7 @@ def drawn(family: LoadFamily, name: str, mean: float, process: Process) -> LoadP
     return telegraph(family, mean)
 
 
-def find_load(name: str, mean_w: float, process: Process) -> LoadProfile:
+def find_load(name: str, mean_w: float, process: declaration.Process) -> load_profile.LoadProfile:
     """Return the load of a name or of a CSV file for a process.
 
     Raises:
@@ -145,7 +143,7 @@ def find_load(name: str, mean_w: float, process: Process) -> LoadProfile:
     path = Path(name)
     if not path.exists():
         raise LoadFileError(f"load {name}: neither a file nor one of {', '.join(NAMED)}")
-    return read_load_file(path, process)
+    return load_profile.read_load_file(path, process)
 
 
 MOST_UPCOMING: Final = 2 * LOAD_ROWS  # Steps to come that are kept
@@ -163,7 +161,7 @@ class LoadSchedule:
         load: What a load of the process may be.
     """
 
-    def __init__(self, profile: LoadProfile, load: Load) -> None:
+    def __init__(self, profile: load_profile.LoadProfile, load: sections.Load) -> None:
         self._load = load
         self._times = list(profile.times)
         self._watts = list(profile.watts)
@@ -213,7 +211,7 @@ class LoadSchedule:
         free = max(0, MOST_UPCOMING - upcoming)
         return LoadStatus(self._watts[place], *coming, self._times[-1], min(upcoming, 0xFFFF), free)
 
-    def from_tick(self, now: int) -> LoadProfile:
+    def from_tick(self, now: int) -> load_profile.LoadProfile:
         """Return the load from tick `now` on; what was before is given as what is held now."""
         place = self._place(now)
-        return LoadProfile((0, *self._times[place + 1 :]), tuple(self._watts[place:]))
+        return load_profile.LoadProfile((0, *self._times[place + 1 :]), tuple(self._watts[place:]))

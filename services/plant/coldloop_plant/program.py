@@ -8,8 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 from coldloop.registers.plant import StationSample, StationStatus, Surroundings
 from coldloop_plant.numeric import RealArray
 
@@ -62,7 +61,7 @@ class PlantProgram:
         u0: Sequence[float],
         load: HeatLoad,
         noise: MeasurementNoise | None = None,
-        process: Process = COLD_BOX,
+        process: declaration.Process = cold_box.COLD_BOX,
     ) -> None:
         self.process = process
         self.tick = 0

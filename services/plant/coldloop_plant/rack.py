@@ -12,12 +12,9 @@ from typing import Annotated, Any, Final, NamedTuple, Self
 from pydantic import BaseModel, Field, model_validator
 
 from coldloop.kernels.single_precision import single
-from coldloop.process.cold_box import COLD_BOX, STATION_SIGNAL_NAMES, ModelRange
-from coldloop.process.declaration import LAST_TICK, Process
-from coldloop.process.load_profile import LoadProfile
+from coldloop.process import cold_box, declaration, load_profile
+from coldloop.registers import bank, common
 from coldloop.registers import plant as registers
-from coldloop.registers.bank import Caller
-from coldloop.registers.common import EventKind, pace_subject
 from coldloop.registers.plant import Actuators, OutputVerdict, SensorFault, SensorFaultKind
 from coldloop.safety.watchdog import Watchdog
 from coldloop.safety.writers import SIMPLE_CLIENT
@@ -60,7 +57,7 @@ class AppliedOutputs:
         self.holder = holder
         self.generation = generation
         self.verdict = OutputVerdict.NONE  # On the outputs that were sent last in this generation
-        self._writer: Caller | None = None
+        self._writer: bank.Caller | None = None
 
     def begin_tick(self) -> None:
         """Note that a tick of the rack begins."""
@@ -73,7 +70,7 @@ class AppliedOutputs:
         self._begin_generation()
 
     def offer(
-        self, asked: Actuators, caller: Caller, *, session: int, tick: int, realtime: bool, ended: bool = False
+        self, asked: Actuators, caller: bank.Caller, *, session: int, tick: int, realtime: bool, ended: bool = False
     ) -> OutputVerdict:
         """Judge outputs, and take them if they are for the present session (0 is none), tick and generation.
 
@@ -87,7 +84,7 @@ class AppliedOutputs:
             self.verdict = self._judge_writer(asked, caller)
         return self.verdict
 
-    def _judge_writer(self, asked: Actuators, caller: Caller) -> OutputVerdict:
+    def _judge_writer(self, asked: Actuators, caller: bank.Caller) -> OutputVerdict:
         writer = self._writer
         if writer is not None and (
             asked.holder != self.holder or (asked.holder == SIMPLE_CLIENT and writer.connection != caller.connection)
@@ -134,7 +131,7 @@ class RetainedPlantState(BaseModel, frozen=True, extra="forbid"):
     session: Count  # 0: none yet; the other fields are as configured
     pace: TimeBase
     watchdog: Annotated[int, Field(ge=0, lt=2**16)]  # Its time-out, in ticks
-    times: tuple[Annotated[int, Field(ge=0, le=LAST_TICK)], ...]  # Ticks of the load's steps
+    times: tuple[Annotated[int, Field(ge=0, le=declaration.LAST_TICK)], ...]  # Ticks of the load's steps
     watts: tuple[float, ...]
     seed: Count
     program: dict[str, Any]  # Argument of `PlantProgram.resume`
@@ -142,7 +139,7 @@ class RetainedPlantState(BaseModel, frozen=True, extra="forbid"):
     @model_validator(mode="after")
     def _possible(self) -> Self:
         tick = self.program.get("tick", 0)
-        if not isinstance(tick, int) or not 0 <= tick <= LAST_TICK:
+        if not isinstance(tick, int) or not 0 <= tick <= declaration.LAST_TICK:
             raise ValueError(f"no session has a tick {tick!r}")
         return self
 
@@ -157,7 +154,7 @@ class Session(NamedTuple):
 
     number: int  # 0 is none: the plant waits for an operator
     pace: TimeBase
-    load: LoadProfile
+    load: load_profile.LoadProfile
     seed: int
 
 
@@ -185,7 +182,7 @@ class Rack:
         journal: Journal,
         rate: Inputs | None = None,
         generation: int = 1,
-        process: Process = COLD_BOX,
+        process: declaration.Process = cold_box.COLD_BOX,
     ) -> None:
         self.process = process
         self._rate = rate
@@ -217,7 +214,7 @@ class Rack:
     @property
     def has_ended(self) -> bool:
         """The session has reached its last tick: the plant moves again in another one."""
-        return self.tick >= LAST_TICK
+        return self.tick >= declaration.LAST_TICK
 
     @property
     def silence_s(self) -> float:
@@ -234,8 +231,8 @@ class Rack:
         self._set_up(session)
         self.outputs.replace(self._u0)
         pace = session.pace
-        self.journal.note(0, EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
-        self.journal.note(0, EventKind.LOAD, value=session.load.value(0), who=who)
+        self.journal.note(0, common.EventKind.SESSION, int(pace.realtime), value=pace.factor, who=who)
+        self.journal.note(0, common.EventKind.LOAD, value=session.load.value(0), who=who)
 
     def resume(self, state: RetainedPlantState) -> None:
         """Resume a session after a restart of the rack; a new generation of outputs begins.
@@ -244,7 +241,7 @@ class Rack:
             ArithmeticError, AttributeError, LookupError, TypeError, ValueError: It is not the state of such a plant, or
                 one that the plant cannot resume; nothing has changed.
         """
-        load = LoadProfile(state.times, state.watts)
+        load = load_profile.LoadProfile(state.times, state.watts)
         schedule = LoadSchedule(load, self.process.load)
         tried = self._make_plant(schedule, state.seed)  # not used any further: the state may be nonsense
         tried.resume(**state.program)
@@ -277,7 +274,7 @@ class Rack:
 
     # -- outputs -------------------------------------------------------------------------------------------------------
 
-    def offer(self, asked: Actuators, caller: Caller) -> OutputVerdict:
+    def offer(self, asked: Actuators, caller: bank.Caller) -> OutputVerdict:
         """Judge outputs, and apply them from the present tick on if they are taken: at the last one none are."""
         verdict = self.outputs.offer(
             asked, caller, session=self.session.number, tick=self.tick, realtime=self.session.pace.realtime,
@@ -300,20 +297,20 @@ class Rack:
         now, outside = program.station, program.model_range
         if before is not None and now is not None:
             if now.mode != before.mode:
-                self.journal.note(self.tick, EventKind.STATION_MODE, now.mode)
-            self._note_flags(EventKind.STATION_ALARM, registers.StationAlarm, before.alarms, now.alarms)
+                self.journal.note(self.tick, common.EventKind.STATION_MODE, now.mode)
+            self._note_flags(common.EventKind.STATION_ALARM, registers.StationAlarm, before.alarms, now.alarms)
         if outside != self.model_range.outside:
-            self._note_flags(EventKind.MODEL_RANGE, ModelRange, self.model_range.outside, outside)
+            self._note_flags(common.EventKind.MODEL_RANGE, cold_box.ModelRange, self.model_range.outside, outside)
             self.model_range = registers.ModelRangeStatus(outside, self.tick)
         if self.watchdog.check(program.tick):
             safe = self._safety.action is SafeAction.SAFE
             if safe:
                 self.outputs.replace(self._safety.safe_state)
                 program.apply(self.outputs.u)
-            self.journal.note(self.tick, EventKind.WATCHDOG_EXPIRED, int(safe))
+            self.journal.note(self.tick, common.EventKind.WATCHDOG_EXPIRED, int(safe))
         return sample
 
-    def _note_flags(self, kind: EventKind, flags: type[IntFlag], before: int, now: int) -> None:
+    def _note_flags(self, kind: common.EventKind, flags: type[IntFlag], before: int, now: int) -> None:
         """Note which flags have come or gone."""
         for number, flag in enumerate(flags):
             if (before ^ now) & flag:
@@ -329,7 +326,7 @@ class Rack:
         self.program.give(asked)
         for place, (old, new) in enumerate(zip(before or asked, asked, strict=True)):
             if new != old:
-                self.journal.note(self.tick, EventKind.SURROUNDINGS, place, value=float(new), who=who)
+                self.journal.note(self.tick, common.EventKind.SURROUNDINGS, place, value=float(new), who=who)
 
     # -- what operators change -----------------------------------------------------------------------------------------
 
@@ -337,7 +334,7 @@ class Rack:
         """Change the time-out of the watchdog (ticks, 0 is off), and restart it; the same one does nothing."""
         if time == self.watchdog.time:
             return
-        self.journal.note(self.tick, EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
+        self.journal.note(self.tick, common.EventKind.WATCHDOG_TIME, time, self.watchdog.time, who=who)
         self.watchdog.set(time, self.tick)
 
     def load_steps(self, asked: registers.LiveLoad | registers.LoadAhead) -> list[registers.LoadStep]:
@@ -361,7 +358,7 @@ class Rack:
         """Take steps of the load; of those that come in turn from one client, the first only is noted."""
         self.load.put(steps, self.tick)
         if not ahead or who != self._load_by:
-            self.journal.note(self.tick, EventKind.LIVE_LOAD, int(ahead), value=steps[0].watts, who=who)
+            self.journal.note(self.tick, common.EventKind.LIVE_LOAD, int(ahead), value=steps[0].watts, who=who)
         self._load_by = who if ahead else ""
 
     def set_pace(self, pace: TimeBase, who: str) -> None:
@@ -370,7 +367,7 @@ class Rack:
             return
         self.session = self.session._replace(pace=pace)
         self.moving = pace.realtime and (self.moving or self.tick > 0)
-        self.journal.note(self.tick, EventKind.PACE, pace_subject(pace), value=pace.factor, who=who)
+        self.journal.note(self.tick, common.EventKind.PACE, common.pace_subject(pace), value=pace.factor, who=who)
 
     def set_faults(self, faults: Sequence[SensorFault], who: str) -> None:
         """Take the faults of all sensors; one that freezes keeps what it shows now."""
@@ -382,7 +379,9 @@ class Rack:
                 if fault.kind:
                     others = {SensorFaultKind.NOT_A_NUMBER: math.nan, SensorFaultKind.FROZEN: y[output]}
                     self._shown[output] = others.get(SensorFaultKind(fault.kind), fault.value)
-                self.journal.note(self.tick, EventKind.SENSOR_FAULT, output, fault.kind, value=fault.value, who=who)
+                self.journal.note(
+                    self.tick, common.EventKind.SENSOR_FAULT, output, fault.kind, value=fault.value, who=who
+                )
 
     def _readings(self) -> tuple[float, ...]:
         """Return what the sensors show, the faulty ones too."""
@@ -409,7 +408,7 @@ class Rack:
         program, station, further = self.program, self.program.station, dict[str, object]()
         if station is not None:
             further["station"] = {
-                **dict(zip(STATION_SIGNAL_NAMES, station.signals, strict=True)),
+                **dict(zip(cold_box.STATION_SIGNAL_NAMES, station.signals, strict=True)),
                 "mode": registers.StationMode(station.mode).name.lower(),
                 "alarms": [one.name.lower() for one in registers.StationAlarm(station.alarms) if one.name],
             }
@@ -419,6 +418,6 @@ class Rack:
             "load_w": program.load,
             "inputs": dict(zip(self.process.input_names, self.outputs.u, strict=True)),
             "outputs": dict(zip(self.process.output_names, self._readings(), strict=True)),
-            "model_range": [part.name.lower() for part in ModelRange(self.model_range.outside) if part.name],
+            "model_range": [part.name.lower() for part in cold_box.ModelRange(self.model_range.outside) if part.name],
             **further,
         }

@@ -13,8 +13,7 @@ from typing import Any, Final
 
 from pydantic import ValidationError
 
-from coldloop import __version__
-from coldloop.config import selected
+from coldloop import __version__, config
 from coldloop.errors import ColdloopError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.declaration import Process
@@ -24,16 +23,6 @@ from coldloop.registers import common
 from coldloop.registers import plant as registers
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Judge, RegisterBank
 from coldloop.registers.codec import DomainError, check_record
-from coldloop.registers.common import (
-    EventKind,
-    Identity,
-    JournalQuery,
-    LeaseEvent,
-    LeaseStatus,
-    SessionPace,
-    WatchdogStatus,
-    WatchdogTime,
-)
 from coldloop.registers.declaration import Block
 from coldloop.registers.plant import Actuators, LiveLoad, LoadAhead, LoadStep, PlantSession, Surroundings
 from coldloop.safety.retained import RetainedFile, RetainedStateError
@@ -75,7 +64,7 @@ class RackRegisters:
         self._model_digest, process = header.short_digest, header.declared
         self._age = age
         self.bank = RegisterBank(registers.plant_map(process), settings.plant.word_order)
-        common.publish_configuration(self.bank, selected(settings, SHOWN))
+        common.publish_configuration(self.bank, config.selected(settings, SHOWN))
         retained = settings.plant.retain.file
         self._retained = RetainedFile(retained, OWNER, header.short_digest) if retained else None
         self._is_refused = False  # A previous state exists and is not used
@@ -83,7 +72,7 @@ class RackRegisters:
             settings, header, make_plant, utc, first_generation or secrets.randbelow(2**31) + 1
         )
         self._journal = JournalPublication(self.rack.journal, self.bank)
-        self.rack.journal.note(self.rack.tick, EventKind.BOOT, int(resumed), int(self._is_refused))
+        self.rack.journal.note(self.rack.tick, common.EventKind.BOOT, int(resumed), int(self._is_refused))
         self.lease = WriterLease("the outputs", lambda: self.rack.silence_s, self._note_lease, now)
         self._kept_generation = 0
         self._written_row = 0
@@ -99,7 +88,7 @@ class RackRegisters:
             self.bank.put(LiveLoad(0, self.rack.load.value(self.rack.tick)))
         if resumed or session.number:
             self._show_pace()
-        self.bank.put(WatchdogTime(self.rack.watchdog.time))
+        self.bank.put(common.WatchdogTime(self.rack.watchdog.time))
         self.bank.put(self.rack.program.surroundings or Surroundings())
         self._show_applied()
         self._finish()
@@ -138,7 +127,10 @@ class RackRegisters:
             if content is None:
                 return None
             state = RetainedPlantState.model_validate(content)
-            for record in (SessionPace.shown(state.session, state.pace), *map(LoadStep, state.times, state.watts)):
+            for record in (
+                common.SessionPace.shown(state.session, state.pace),
+                *map(LoadStep, state.times, state.watts),
+            ):
                 check_record(record, registers.plant_map(process))
         except (RetainedStateError, DomainError) as error:
             self._refuse(str(error))
@@ -158,33 +150,33 @@ class RackRegisters:
         """Let the bank ask us about what is written and what is read."""
         bank, rack = self.bank, self.rack
         bank.judged_by(lambda asked, _, caller: self._check_lease(caller, asked.holder), Actuators)
-        bank.judged_by(lambda _asked, _row, caller: self._check_lease(caller, None), WatchdogTime)
+        bank.judged_by(lambda _asked, _row, caller: self._check_lease(caller, None), common.WatchdogTime)
         table = "the first {0.load_steps} rows of the load table"
         bank.judged_by(_refusing(table, self._load_of), PlantSession)
         bank.judged_by(self._judge_load, LoadStep)
         bank.judged_by(_refusing("load", rack.load_steps), LiveLoad, LoadAhead)
-        bank.judged_by(_refusing("pace", lambda asked: asked.of(rack.session.number)), SessionPace)
+        bank.judged_by(_refusing("pace", lambda asked: asked.of(rack.session.number)), common.SessionPace)
         bank.judged_by(self._judge_surroundings, Surroundings)
-        bank.keep_fresh(Identity, self._identity)
+        bank.keep_fresh(common.Identity, self._identity)
         bank.keep_fresh(registers.Measurement, self._measurement)
-        bank.keep_fresh(WatchdogStatus, lambda: rack.watchdog.registers(rack.tick))
-        bank.keep_fresh(LeaseStatus, self.lease.registers)
+        bank.keep_fresh(common.WatchdogStatus, lambda: rack.watchdog.registers(rack.tick))
+        bank.keep_fresh(common.LeaseStatus, self.lease.registers)
         bank.keep_fresh(registers.StationStatus, lambda: rack.program.station_status)
         bank.keep_fresh(registers.ModelRangeStatus, lambda: rack.model_range)
         bank.keep_fresh(registers.LoadStatus, lambda: rack.load.status(rack.tick))
         sensors = range(len(rack.process.outputs))
         self._takers: dict[type[tuple[object, ...]], Callable[[str], None]] = {
             PlantSession: self._start_session,
-            WatchdogTime: lambda who: rack.set_watchdog(bank.get(WatchdogTime).time, who),
+            common.WatchdogTime: lambda who: rack.set_watchdog(bank.get(common.WatchdogTime).time, who),
             registers.SensorFault: lambda who: rack.set_faults(
                 [bank.get(registers.SensorFault, row) for row in sensors], who
             ),
             LoadStep: self._note_load,
             LiveLoad: self._set_load,
             LoadAhead: lambda who: rack.set_load(rack.load_steps(bank.get(LoadAhead)), who, ahead=True),
-            SessionPace: self._set_pace,
+            common.SessionPace: self._set_pace,
             Surroundings: lambda who: rack.give(bank.get(Surroundings), who),
-            JournalQuery: lambda _: self._journal.answer(bank.get(JournalQuery)),
+            common.JournalQuery: lambda _: self._journal.answer(bank.get(common.JournalQuery)),
         }
 
     # -- judging, before anything is stored ----------------------------------------------------------------------------
@@ -240,7 +232,7 @@ class RackRegisters:
     def _note_load(self, who: str) -> None:
         row = self._written_row
         watts = self.bank.get(LoadStep, row).watts
-        self.rack.journal.note(self.rack.tick, EventKind.LOAD, row, value=watts, who=who)
+        self.rack.journal.note(self.rack.tick, common.EventKind.LOAD, row, value=watts, who=who)
 
     def _set_load(self, who: str) -> None:
         steps = self.rack.load_steps(self.bank.get(LiveLoad))
@@ -249,12 +241,12 @@ class RackRegisters:
         self.bank.put(LiveLoad(0, steps[0].watts))
 
     def _set_pace(self, who: str) -> None:
-        self.rack.set_pace(self.bank.get(SessionPace).of(self.rack.session.number), who)
+        self.rack.set_pace(self.bank.get(common.SessionPace).of(self.rack.session.number), who)
         self._show_pace()
 
     def _show_pace(self) -> None:
         session = self.rack.session
-        self.bank.put(SessionPace.shown(session.number, session.pace))
+        self.bank.put(common.SessionPace.shown(session.number, session.pace))
 
     def closed(self, caller: Caller) -> None:
         """Note that a connection has closed."""
@@ -293,9 +285,9 @@ class RackRegisters:
         self._outdated = False
         return self.rack.measurement(age, self.lease.refused)
 
-    def _identity(self) -> Identity:
+    def _identity(self) -> common.Identity:
         rack = self.rack
-        return Identity(
+        return common.Identity(
             map_digest=self.bank.map.digest, map_version=self.bank.map.version,
             state=common.ServiceState.RUNNING if rack.session.number else common.ServiceState.READY,
             model_digest=self._model_digest, session=rack.session.number, tick=rack.tick,
@@ -307,8 +299,8 @@ class RackRegisters:
         rack, outputs = self.rack, self.rack.outputs
         self.bank.put_sealed(Actuators(rack.tick, outputs.u, rack.session.number, outputs.holder, outputs.generation))
 
-    def _note_lease(self, event: LeaseEvent, who: str) -> None:
-        self.rack.journal.note(self.rack.tick, EventKind.LEASE, event, who=who)
+    def _note_lease(self, event: common.LeaseEvent, who: str) -> None:
+        self.rack.journal.note(self.rack.tick, common.EventKind.LEASE, event, who=who)
 
     def _finish(self) -> None:
         """End a request: show its events, and retain them: no generation and no event number is given out twice."""
@@ -366,7 +358,7 @@ class PlantRuntime:
         if block.record is PlantSession:
             self._stop_clock()
             self._position = None
-        elif block.record is SessionPace and rack.session.pace != before:
+        elif block.record is common.SessionPace and rack.session.pace != before:
             self._change_pace()
         elif block.record is Actuators and rack.moving:
             if rack.session.pace.realtime:

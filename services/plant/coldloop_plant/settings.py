@@ -8,9 +8,8 @@ from typing import Annotated, Final
 from pydantic import Field, FiniteFloat, PositiveFloat, field_validator, model_validator
 
 from coldloop.modbus.settings import PLANT_PORT, ServerSettings
+from coldloop.process import cold_box, sections
 from coldloop.process import settings as common
-from coldloop.process.cold_box import TICK_S
-from coldloop.process.sections import Section
 from coldloop.process.settings import InputLimits, PerInput, ProcessSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
@@ -30,7 +29,7 @@ Bar = Annotated[float, Field(gt=0, le=100)]
 Percent = Annotated[float, Field(ge=0, le=100)]
 
 
-class MismatchSettings(Section):
+class MismatchSettings(sections.Section):
     """Mismatch of the cold box to its model: most values are factors. It begins at the model's point of rest."""
 
     heat_transfer: Factor = 1.0
@@ -149,7 +148,7 @@ class StationControlKind(StrEnum):
     """The low pressure by the bypass, the high pressure by the buffer's valves, each a PI."""
 
 
-class LqWeights(Section):
+class LqWeights(sections.Section):
     """Weights of the LQ controller: 1 over the square of each of these."""
 
     hp_bar: PositiveFloat = 0.1
@@ -166,7 +165,7 @@ class LqWeights(Section):
     """Flow into or out of the buffer, kg/s."""
 
 
-class PiTuning(Section):
+class PiTuning(sections.Section):
     """Gain and integral time of one loop."""
 
     gain: PositiveFloat
@@ -175,7 +174,7 @@ class PiTuning(Section):
     """Integral time, s."""
 
 
-class StationAlarmSettings(Section):
+class StationAlarmSettings(sections.Section):
     """Limits at which the station's alarms begin."""
 
     hp_high_bar: Bar = 16.8
@@ -200,7 +199,7 @@ class StationAlarmSettings(Section):
         return self
 
 
-class CompressorStart(Section):
+class CompressorStart(sections.Section):
     """Start of a compressor: it idles with the bypass open, then it is loaded in a ramp."""
 
     idle: Annotated[float, Field(gt=0, lt=1)] = 0.25
@@ -213,7 +212,7 @@ class CompressorStart(Section):
     """Share of what the first one gives that the cold box takes when the second one is started."""
 
 
-class PressureProtection(Section):
+class PressureProtection(sections.Section):
     """Pressures that override the controller, fully from the second one on, and those that stop a compressor."""
 
     hp_bar: tuple[Bar, Bar] = (17.0, 17.6)
@@ -233,7 +232,7 @@ class PressureProtection(Section):
         return self
 
 
-class TurbineProtection(Section):
+class TurbineProtection(sections.Section):
     """Start of the turbine, and its largest speed."""
 
     run_up_s: Annotated[float, Field(ge=1, le=3600)] = 60.0
@@ -250,7 +249,7 @@ class TurbineProtection(Section):
         return self
 
 
-class StationSettings(Section):
+class StationSettings(sections.Section):
     """Section `plant.station`: the controller of the compression station."""
 
     control: StationControlKind = StationControlKind.LQ
@@ -326,7 +325,7 @@ MEASURED = {EventTarget.LEAK, EventTarget.AMBIENT, *BLOCKING}
 """Targets with a value; the others are in one of a few states, numbered from 0."""
 
 
-class RefrigeratorEvent(Section):
+class RefrigeratorEvent(sections.Section):
     """Change of one boundary condition or piece of equipment from a time on."""
 
     at_s: Annotated[float, Field(ge=0, le=1e9)]
@@ -343,14 +342,14 @@ class RefrigeratorEvent(Section):
         if self.target not in MEASURED and not self.value.is_integer():
             states = "0 or 1" if high == 1.0 else "0, 1 or 2"
             raise ValueError(f"{self.target} = {self.value:g}: write {states}")
-        if self.at_s % TICK_S:
-            raise ValueError(f"{self.at_s:g} s is not a multiple of {TICK_S} s")
+        if self.at_s % cold_box.TICK_S:
+            raise ValueError(f"{self.at_s:g} s is not a multiple of {cold_box.TICK_S} s")
         return self
 
     @property
     def tick(self) -> int:
         """The first tick that it concerns."""
-        return round(self.at_s / TICK_S)
+        return round(self.at_s / cold_box.TICK_S)
 
 
 class RefrigeratorStart(StrEnum):
@@ -362,7 +361,7 @@ class RefrigeratorStart(StrEnum):
     """At ambient temperature, its helium in the buffer, its compressors about to start."""
 
 
-class RefrigeratorSettings(Section):
+class RefrigeratorSettings(sections.Section):
     """Start and disturbances of a refrigerator."""
 
     file: Path | None = None

@@ -5,11 +5,9 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, ConfigDict, Field, TypeAdapter, ValidationError, field_validator
 
 from coldloop.errors import LoadFileError, UsageError
-from coldloop.process.declaration import LAST_TICK, Process
-from coldloop.process.load_profile import LoadProfile, load_profile_of
+from coldloop.process import declaration, load_profile
 from coldloop.process.settings import ProcessSettings, one_of, settings_of, settings_process, within
-from coldloop.registers.common import ALL_ALARMS, AlarmAction, alarms_of
-from coldloop.registers.plant import SensorFaultKind
+from coldloop.registers import common, plant
 from coldloop.service.journal import alarm_word
 from coldloop.text import value_text
 
@@ -86,7 +84,7 @@ class SetLoad(_Command):
 
     kind: Literal["load"]
     watts: Annotated[float, within(lambda process: process.load.stored_span)]
-    tick: Annotated[int, Field(ge=0, le=LAST_TICK)] = 0
+    tick: Annotated[int, Field(ge=0, le=declaration.LAST_TICK)] = 0
     """0 is the next one."""
 
     def _words(self) -> str:
@@ -97,7 +95,7 @@ class SetLoad(_Command):
 
 def _readable(content: str) -> str:
     try:
-        steps = len(load_profile_of(content, "load file", settings_process()).times)
+        steps = len(load_profile.load_profile_of(content, "load file", settings_process()).times)
     except LoadFileError as error:
         raise ValueError(str(error)) from None
     if steps > MOST_STEPS:
@@ -112,9 +110,9 @@ class PlayLoad(_Command):
     content: Annotated[str, Field(max_length=LONGEST_FILE), AfterValidator(_readable)]
 
     @property
-    def profile(self) -> LoadProfile:
+    def profile(self) -> load_profile.LoadProfile:
         """The load in the file."""
-        return load_profile_of(self.content, "load file", self.process)
+        return load_profile.load_profile_of(self.content, "load file", self.process)
 
     def _words(self) -> str:
         times = self.profile.times
@@ -157,14 +155,14 @@ class TreatAlarm(_Command):
     @field_validator("alarm")
     @classmethod
     def _known(cls, alarm: int) -> int:
-        if alarm != ALL_ALARMS and alarm not in alarms_of(settings_process()):
+        if alarm != common.ALL_ALARMS and alarm not in common.alarms_of(settings_process()):
             raise ValueError(f"unknown alarm {alarm}")
         return alarm
 
     def _words(self) -> str:
-        name = "all alarms" if self.alarm == ALL_ALARMS else f"alarm {alarm_word(self.alarm, self.process)}"
-        time = f" for {duration_text(self.time_s)}" if self.action == AlarmAction.SHELVE and self.time_s else ""
-        return f"{AlarmAction(self.action).word.capitalize()}: {name}{time}"
+        name = "all alarms" if self.alarm == common.ALL_ALARMS else f"alarm {alarm_word(self.alarm, self.process)}"
+        time = f" for {duration_text(self.time_s)}" if self.action == common.AlarmAction.SHELVE and self.time_s else ""
+        return f"{common.AlarmAction(self.action).word.capitalize()}: {name}{time}"
 
 
 class FaultSensor(_Command):
@@ -176,15 +174,15 @@ class FaultSensor(_Command):
     value: float = 0.0
 
     def _words(self) -> str:
-        value = f" ({value_text(self.value)})" if self.fault == SensorFaultKind.VALUE else ""
-        return f"Training: sensor of {self.output}: {SensorFaultKind(self.fault).word}{value}"
+        value = f" ({value_text(self.value)})" if self.fault == plant.SensorFaultKind.VALUE else ""
+        return f"Training: sensor of {self.output}: {plant.SensorFaultKind(self.fault).word}{value}"
 
 
 Command = SetMode | SetSetpoint | SetLoad | PlayLoad | SetFactor | SetPaused | TreatAlarm | FaultSensor
 _COMMAND: Final[TypeAdapter[Command]] = TypeAdapter(Annotated[Command, Field(discriminator="kind")])
 
 
-def read_command(document: object, process: Process) -> Command:
+def read_command(document: object, process: declaration.Process) -> Command:
     """Return a command for a process as it was sent.
 
     Raises:

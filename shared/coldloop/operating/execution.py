@@ -10,24 +10,11 @@ from typing import Any, Final, TypeVar
 from coldloop.errors import BUSY, LinkError, PeerUnreachableError, RequestRefusedError, UsageError
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.settings import Endpoint
-from coldloop.operating import commands
+from coldloop.operating import commands, observer
 from coldloop.operating.commands import Command, TreatAlarm, clock_text
-from coldloop.operating.observer import read_alarms
-from coldloop.process.declaration import Process
-from coldloop.process.load_profile import LoadProfile
-from coldloop.registers import Maps, maps_of
+from coldloop.process import declaration, load_profile
+from coldloop.registers import Maps, codec, common, maps_of
 from coldloop.registers import plant as registers
-from coldloop.registers.codec import sealed
-from coldloop.registers.common import (
-    ALL_ALARMS,
-    Alarm,
-    AlarmAction,
-    AlarmCommand,
-    AlarmState,
-    Identity,
-    SessionPace,
-    alarms_of,
-)
 from coldloop.registers.control_plc import Cause, LadderStatus, Mode, Operator, OperatorMode
 from coldloop.service.journal import alarm_word
 from coldloop.text import value_text
@@ -45,7 +32,7 @@ LEAD_S: Final = 2.0
 """... and not sooner than this by the clock: at a high factor ticks pass quickly."""
 MOST_NAMES: Final = 6
 """Alarms that are named; more are counted."""
-WAITING: Final = frozenset({AlarmState.UNACKNOWLEDGED, AlarmState.RETURNED})
+WAITING: Final = frozenset({common.AlarmState.UNACKNOWLEDGED, common.AlarmState.RETURNED})
 HINTS: Final = {
     1: "the certificate or the address of this client does not have the operator role",
     3: "the value is not possible now",
@@ -61,7 +48,7 @@ class LoadStream:
     """
 
     def __init__(
-        self, plant: RegisterClient, session: int, load: LoadProfile, *, sent: int = 0, begin: int = 0
+        self, plant: RegisterClient, session: int, load: load_profile.LoadProfile, *, sent: int = 0, begin: int = 0
     ) -> None:
         self._plant = plant
         self._session = session
@@ -119,7 +106,7 @@ class LoadStream:
         record = registers.LoadAhead.first_of(self._session, self._times[some], self._watts[some])
         self._unanswered = record.length
         try:
-            await self._plant.write(sealed(record, self._plant.map))
+            await self._plant.write(codec.sealed(record, self._plant.map))
         except LinkError as error:
             if not self._sent:
                 raise
@@ -142,7 +129,7 @@ class LoadStream:
         return status.last_tick != last
 
 
-async def write_table(plant: RegisterClient, load: LoadProfile) -> int:
+async def write_table(plant: RegisterClient, load: load_profile.LoadProfile) -> int:
     """Write the load table of a session that is to begin; return the steps that are in it.
 
     Raises:
@@ -179,7 +166,7 @@ Clients = Mapping[str, CommandClient]
 """One for each service that a command concerns; connected."""
 
 
-def clients_of(endpoints: Mapping[str, Endpoint], process: Process) -> dict[str, CommandClient]:
+def clients_of(endpoints: Mapping[str, Endpoint], process: declaration.Process) -> dict[str, CommandClient]:
     """Return clients of services of a process, not connected yet."""
     maps = maps_of(process).by_service
     return {service: CommandClient.at(maps[service], endpoint) for service, endpoint in endpoints.items()}
@@ -267,10 +254,10 @@ async def set_load(clients: Clients, command: commands.SetLoad) -> str:
         LinkError: The plant knows another load afterwards.
     """
     client = clients["plant"]
-    before, now = await client.read(registers.LoadStatus), (await client.read(Identity)).tick
+    before, now = await client.read(registers.LoadStatus), (await client.read(common.Identity)).tick
     if 0 < command.tick <= now:
         raise UsageError(f"plant time is {now * client.process.tick_s:g} s already: name a later one")
-    await client.write(sealed(registers.LiveLoad(command.tick, command.watts), client.map))
+    await client.write(codec.sealed(registers.LiveLoad(command.tick, command.watts), client.map))
     status = await _read_until(
         lambda: client.read(registers.LoadStatus),
         lambda status: bool(command.tick) or math.isclose(status.watts, command.watts, rel_tol=1e-6),
@@ -292,7 +279,9 @@ async def play_load(clients: Clients, command: commands.PlayLoad) -> str:
     return await stream_load(clients, command.profile, 0, None)
 
 
-async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Callable[[str], None] | None) -> str:
+async def stream_load(
+    clients: Clients, load: load_profile.LoadProfile, tick: int, say: Callable[[str], None] | None
+) -> str:
     """Write a load of any length from a tick on (0 is now), as fast as the plant can store it.
 
     Raises:
@@ -300,12 +289,12 @@ async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Calla
         LinkError: Another client has overwritten it; or the plant has no room for all of it, and nobody to `say` so to.
     """
     plant = clients["plant"]
-    identity, tick_s = await plant.read(Identity), plant.process.tick_s
+    identity, tick_s = await plant.read(common.Identity), plant.process.tick_s
     if not identity.session:
         raise UsageError("the plant has no session")
     if 0 < tick <= identity.tick:
         raise UsageError(f"plant time is {identity.tick * tick_s:g} s already: name a later one")
-    begin = tick or identity.tick + lead_ticks(await plant.read(SessionPace), tick_s)
+    begin = tick or identity.tick + lead_ticks(await plant.read(common.SessionPace), tick_s)
     stream = LoadStream(plant, identity.session, load, begin=begin)
     taken = await stream.fill()
     if not stream.done:
@@ -321,7 +310,7 @@ async def stream_load(clients: Clients, load: LoadProfile, tick: int, say: Calla
     return f"load of {stream.steps} steps from {begin * tick_s:g} s to {end * tick_s:g} s; its last value is held"
 
 
-def lead_ticks(pace: SessionPace, tick_s: float) -> int:
+def lead_ticks(pace: common.SessionPace, tick_s: float) -> int:
     """Return how many ticks ahead of now a load is to begin."""
     return max(LEAD_TICKS, math.ceil(LEAD_S * pace.factor / tick_s)) if pace.realtime else LEAD_TICKS
 
@@ -333,13 +322,13 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
         UsageError: None is as the operator has seen it.
         NotTakenError: Nothing of the command took effect.
     """
-    client, action = clients["control_plc"], AlarmAction(command.action)
-    kinds = list(alarms_of(command.process)) if command.alarm == ALL_ALARMS else [command.alarm]
+    client, action = clients["control_plc"], common.AlarmAction(command.action)
+    kinds = list(common.alarms_of(command.process)) if command.alarm == common.ALL_ALARMS else [command.alarm]
     raised_again: list[int] = []
-    before = await read_alarms(client)
+    before = await observer.read_alarms(client)
     if command.seen is None:
-        await client.write(AlarmCommand(command.alarm, action, command.time_s))
-        if action is AlarmAction.ACKNOWLEDGE:
+        await client.write(common.AlarmCommand(command.alarm, action, command.time_s))
+        if action is common.AlarmAction.ACKNOWLEDGE:
             kinds = [kind for kind in kinds if before[kind].state in WAITING]
             if not kinds:
                 return "no alarm waits to be acknowledged"
@@ -354,37 +343,45 @@ async def treat_alarm(clients: Clients, command: TreatAlarm) -> str:
             again = _names(raised_again, command.process)
             raise UsageError(f"raised again since it was shown: {again}; look at it first")
         for kind in kinds:
-            await client.write(AlarmCommand(kind, action, command.time_s))
+            await client.write(common.AlarmCommand(kind, action, command.time_s))
     rows = await _read_until(
-        lambda: read_alarms(client), lambda rows: all(_is_done(action, rows[kind].state) for kind in kinds)
+        lambda: observer.read_alarms(client), lambda rows: all(_is_done(action, rows[kind].state) for kind in kinds)
     )
     return _treated(command, rows, kinds, raised_again)
 
 
-def _is_done(action: AlarmAction, state: int) -> bool:
-    if action is AlarmAction.ACKNOWLEDGE:
+def _is_done(action: common.AlarmAction, state: int) -> bool:
+    if action is common.AlarmAction.ACKNOWLEDGE:
         return state not in WAITING
-    if action in (AlarmAction.SHELVE, AlarmAction.OUT_OF_SERVICE):
-        return state == {AlarmAction.SHELVE: AlarmState.SHELVED}.get(action, AlarmState.OUT_OF_SERVICE)
-    return state != {AlarmAction.UNSHELVE: AlarmState.SHELVED}.get(action, AlarmState.OUT_OF_SERVICE)
+    if action in (common.AlarmAction.SHELVE, common.AlarmAction.OUT_OF_SERVICE):
+        return state == {common.AlarmAction.SHELVE: common.AlarmState.SHELVED}.get(
+            action, common.AlarmState.OUT_OF_SERVICE
+        )
+    return state != {common.AlarmAction.UNSHELVE: common.AlarmState.SHELVED}.get(
+        action, common.AlarmState.OUT_OF_SERVICE
+    )
 
 
-def _treated(command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[int], raised_again: Sequence[int]) -> str:
-    action, process = AlarmAction(command.action), command.process
+def _treated(
+    command: TreatAlarm, rows: Sequence[common.Alarm], kinds: Sequence[int], raised_again: Sequence[int]
+) -> str:
+    action, process = common.AlarmAction(command.action), command.process
     left = [kind for kind in kinds if not _is_done(action, rows[kind].state)]
     if len(left) == len(kinds):
-        states = ", ".join(sorted({AlarmState(rows[kind].state).word for kind in left}))
+        states = ", ".join(sorted({common.AlarmState(rows[kind].state).word for kind in left}))
         raise NotTakenError(f"{_names(left, process)}: {states}; the control PLC did not take it")
     done = [kind for kind in kinds if kind not in left]
     if len(kinds) == 1:
         row = rows[kinds[0]]
-        until = f" until {clock_text(row.shelved_until * process.tick_s)}" if row.state == AlarmState.SHELVED else ""
-        over = action is AlarmAction.ACKNOWLEDGE and row.state == AlarmState.NORMAL
-        state = AlarmState(row.state).word
+        until = (
+            f" until {clock_text(row.shelved_until * process.tick_s)}" if row.state == common.AlarmState.SHELVED else ""
+        )
+        over = action is common.AlarmAction.ACKNOWLEDGE and row.state == common.AlarmState.NORMAL
+        state = common.AlarmState(row.state).word
         text = f"alarm {alarm_word(kinds[0], process)}: {'acknowledged, now ' if over else ''}{state}{until}"
     elif len(kinds) <= MOST_NAMES:
         states = "; ".join(f"now {state.word}: {_names(each, process)}" for state, each in _by_state(rows, done))
-        text = f"acknowledged; {states}" if action is AlarmAction.ACKNOWLEDGE else states
+        text = f"acknowledged; {states}" if action is common.AlarmAction.ACKNOWLEDGE else states
     else:
         counted = ", ".join(f"{len(each)} {state.word}" for state, each in _by_state(rows, done))
         text = f"of {len(kinds)} alarms {counted}"
@@ -395,13 +392,13 @@ def _treated(command: TreatAlarm, rows: Sequence[Alarm], kinds: Sequence[int], r
     return text
 
 
-def _by_state(rows: Sequence[Alarm], kinds: Sequence[int]) -> list[tuple[AlarmState, list[int]]]:
+def _by_state(rows: Sequence[common.Alarm], kinds: Sequence[int]) -> list[tuple[common.AlarmState, list[int]]]:
     """Return the states in which alarms are, and which ones are in each."""
-    sorted_out = [(state, [kind for kind in kinds if rows[kind].state == state]) for state in AlarmState]
+    sorted_out = [(state, [kind for kind in kinds if rows[kind].state == state]) for state in common.AlarmState]
     return [(state, each) for state, each in sorted_out if each]
 
 
-def _names(kinds: Sequence[int], process: Process) -> str:
+def _names(kinds: Sequence[int], process: declaration.Process) -> str:
     return ", ".join(alarm_word(kind, process) for kind in kinds)
 
 
@@ -416,7 +413,7 @@ async def fault_sensor(clients: Clients, command: commands.FaultSensor) -> str:
 async def set_pace(clients: Clients, command: commands.SetFactor | commands.SetPaused) -> str:
     """Write how fast plant time goes, pause or resume it."""
     plant = clients["plant"]
-    pace = await plant.read(SessionPace)
+    pace = await plant.read(common.SessionPace)
     if isinstance(command, commands.SetFactor):
         pace = pace._replace(realtime=1, factor=command.factor)
     else:
@@ -424,18 +421,18 @@ async def set_pace(clients: Clients, command: commands.SetFactor | commands.SetP
     if not pace.realtime:
         raise UsageError("the session is in lock-step: time advances as it is granted")
     await write_pace(clients, pace)
-    back, tick = await plant.read(SessionPace), (await plant.read(Identity)).tick
+    back, tick = await plant.read(common.SessionPace), (await plant.read(common.Identity)).tick
     state, time_s = "paused" if back.paused else "running", tick * plant.process.tick_s
     return f"{state} at {time_s:g} s, factor {value_text(back.factor)}"
 
 
-async def write_pace(clients: Mapping[str, RegisterClient], pace: SessionPace) -> None:
+async def write_pace(clients: Mapping[str, RegisterClient], pace: common.SessionPace) -> None:
     """Write the time base of a session: the plant first, then those who follow it. An optimiser may be in none yet.
 
     Raises:
         LinkError: One refuses, or does not answer; or the control PLC is not in the session of the plant.
     """
-    sessions = {service: (await client.read(Identity)).session for service, client in clients.items()}
+    sessions = {service: (await client.read(common.Identity)).session for service, client in clients.items()}
     if sessions["control_plc"] != sessions["plant"]:
         raise LinkError(
             f"{clients['control_plc'].peer} is in session {sessions['control_plc']}, the plant in {sessions['plant']}: "

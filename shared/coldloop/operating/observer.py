@@ -11,20 +11,7 @@ from typing import Final, Protocol, TypeVar
 
 from coldloop.errors import LinkError, RequestRefusedError
 from coldloop.modbus.client import REQUESTS_AT_ONCE, RegisterClient
-from coldloop.registers.common import (
-    EVENT_ROWS,
-    QUERY_ROWS,
-    Alarm,
-    Event,
-    Identity,
-    JournalAnswer,
-    JournalPage,
-    JournalQuery,
-    alarms_of,
-)
-from coldloop.registers.optimizer_plc import HISTORY_ROWS as UPDATE_ROWS
-from coldloop.registers.optimizer_plc import Optimization
-from coldloop.registers.plant import HISTORY_ROWS, STATION_ROWS, PlantSample, StationSample
+from coldloop.registers import common, optimizer_plc, plant
 from coldloop.service.journal import ANY_SUBJECT
 
 R = TypeVar("R", bound=tuple[object, ...])
@@ -46,16 +33,16 @@ class Subscriber(Protocol):
     def next_tick(self) -> int:
         """First tick that is still to come."""
 
-    def sample(self, sample: PlantSample) -> None:
+    def sample(self, sample: plant.PlantSample) -> None:
         """Take a tick."""
 
-    def station(self, sample: StationSample) -> None:
+    def station(self, sample: plant.StationSample) -> None:
         """Take what goes with a tick that is about to come."""
 
-    def update(self, update: Optimization) -> None:
+    def update(self, update: optimizer_plc.Optimization) -> None:
         """Take an update."""
 
-    def event(self, event: Event, service: str = "control_plc") -> None:
+    def event(self, event: common.Event, service: str = "control_plc") -> None:
         """Take an event."""
 
 
@@ -71,15 +58,19 @@ async def read_ring(client: RegisterClient, record: type[R], ring: int, first: i
     return rows + await client.read_rows(record, 0, count - behind)
 
 
-async def read_alarms(control: RegisterClient) -> list[Alarm]:
+async def read_alarms(control: RegisterClient) -> list[common.Alarm]:
     """Return the alarms of a control PLC, by number."""
-    return await control.read_rows(Alarm, 0, len(alarms_of(control.process)))
+    return await control.read_rows(common.Alarm, 0, len(common.alarms_of(control.process)))
 
 
-async def last_update(optimizer: RegisterClient) -> Optimization | None:
+async def last_update(optimizer: RegisterClient) -> optimizer_plc.Optimization | None:
     """Return the update that an optimiser has done last; None before the first."""
-    newest = (await optimizer.read(Identity)).heartbeat - 1
-    return None if newest < 0 else (await read_ring(optimizer, Optimization, UPDATE_ROWS, newest, newest))[0]
+    newest = (await optimizer.read(common.Identity)).heartbeat - 1
+    return (
+        None
+        if newest < 0
+        else (await read_ring(optimizer, optimizer_plc.Optimization, optimizer_plc.HISTORY_ROWS, newest, newest))[0]
+    )
 
 
 class SampleReader:
@@ -111,7 +102,7 @@ class SampleReader:
         Raises:
             LinkError: The plant does not answer, is in another session, or has overwritten ticks.
         """
-        identity = await self._client.read(Identity)
+        identity = await self._client.read(common.Identity)
         if identity.session != self._session:
             raise LinkError(
                 f"{self._client.peer} was taken over by session {identity.session}, or was restarted without a "
@@ -119,7 +110,7 @@ class SampleReader:
             )
         last = min(identity.tick, self._end)
         if self._tolerant:
-            self.read_until = max(min(self.read_until, last), last - HISTORY_ROWS + MARGIN)
+            self.read_until = max(min(self.read_until, last), last - plant.HISTORY_ROWS + MARGIN)
         if last - self.read_until >= max(1, min(self._at_once, self._end - self.read_until)):
             await self._read_rows(last)
         return identity.tick
@@ -129,12 +120,12 @@ class SampleReader:
         while self.read_until < last:
             first = self.read_until
             until = min(last, first + REQUESTS_AT_ONCE)
-            samples = await read_ring(self._client, PlantSample, HISTORY_ROWS, first, until - 1)
+            samples = await read_ring(self._client, plant.PlantSample, plant.HISTORY_ROWS, first, until - 1)
             if self.has_station is None:  # the first row that is read decides
-                (station,) = await read_ring(self._client, StationSample, STATION_ROWS, first, first)
+                (station,) = await read_ring(self._client, plant.StationSample, plant.STATION_ROWS, first, first)
                 self.has_station = any(station.signals)
             if self.has_station:
-                rows = await read_ring(self._client, StationSample, STATION_ROWS, first, until - 1)
+                rows = await read_ring(self._client, plant.StationSample, plant.STATION_ROWS, first, until - 1)
                 for tick, station in enumerate(rows, first):
                     if any(station.signals) and station.tick == tick:
                         self._subscriber.station(station)
@@ -157,8 +148,8 @@ class UpdateReader:
     """
 
     def __init__(
-        self, client: RegisterClient, take: Callable[[Optimization], None], session: int | None = None, *,
-        first: int | None = None, tolerant: bool = True, most: int = UPDATE_ROWS,
+        self, client: RegisterClient, take: Callable[[optimizer_plc.Optimization], None], session: int | None = None, *,
+        first: int | None = None, tolerant: bool = True, most: int = optimizer_plc.HISTORY_ROWS,
     ) -> None:  # fmt: skip
         self._client = client
         self._take = take
@@ -167,9 +158,9 @@ class UpdateReader:
         self._tolerant = tolerant
         self._most = most
         self._next = first
-        self._last: Optimization | None = None
+        self._last: optimizer_plc.Optimization | None = None
 
-    async def read(self, identity: Identity | None = None) -> int:
+    async def read(self, identity: common.Identity | None = None) -> int:
         """Read the updates that have been done since the last call; return how many were new.
 
         Args:
@@ -178,7 +169,7 @@ class UpdateReader:
         Raises:
             LinkError: The optimiser does not answer, or has overwritten updates.
         """
-        identity = identity or await self._client.read(Identity)
+        identity = identity or await self._client.read(common.Identity)
         if identity.session != self._session:
             if not self._follows_sessions:
                 return 0
@@ -192,7 +183,8 @@ class UpdateReader:
             known = max(0, newest - self._most)
         found = 0
         for number, update in enumerate(
-            await read_ring(self._client, Optimization, UPDATE_ROWS, known, newest - 1), known
+            await read_ring(self._client, optimizer_plc.Optimization, optimizer_plc.HISTORY_ROWS, known, newest - 1),
+            known,
         ):
             later = self._last is None or update.tick > self._last.tick
             # a row whose update was abandoned for a newer one is empty, or as it was 256 updates before
@@ -222,18 +214,18 @@ class JournalReader:
 
     def __init__(
         self, client: RegisterClient, first: int = 1, kinds: Collection[int] = (), *, queries: bool = True,
-        most: int = EVENT_ROWS,
+        most: int = common.EVENT_ROWS,
     ) -> None:  # fmt: skip
         self._client = client
         self._kinds = frozenset(kinds)
         self._most = most
         self._next = first
         self._newest = 0
-        self._read: list[Event] = []
+        self._read: list[common.Event] = []
         """Read before a request that failed."""
-        self._last: Event | None = None
+        self._last: common.Event | None = None
         self._is_doubtful = False
-        self.page = JournalPage()
+        self.page = common.JournalPage()
         """State of the journal when it was read last."""
         self.limited = not queries
         """Only the last events can be read, as queries are refused."""
@@ -246,7 +238,7 @@ class JournalReader:
         """Compare the last event at the next call: the service may have restarted its count meanwhile."""
         self._is_doubtful = True
 
-    async def read_on(self) -> list[Event]:
+    async def read_on(self) -> list[common.Event]:
         """Return the events up to the newest one that have not been returned yet.
 
         Raises:
@@ -254,7 +246,7 @@ class JournalReader:
                 read so far.
         """
         last, restarts = self._last if self._is_doubtful else None, 0
-        if last and await read_ring(self._client, Event, EVENT_ROWS, last.number, last.number) != [last]:
+        if last and await read_ring(self._client, common.Event, common.EVENT_ROWS, last.number, last.number) != [last]:
             self._restart()
         self._is_doubtful = False
         while True:
@@ -285,21 +277,23 @@ class JournalReader:
     def _restart(self) -> None:
         self.restarted, self._next, self._newest, self._last = True, 1, 0, None
 
-    async def _page(self) -> tuple[JournalPage, list[Event]]:
+    async def _page(self) -> tuple[common.JournalPage, list[common.Event]]:
         if not self.limited:
             kind = next(iter(self._kinds)) if len(self._kinds) == 1 else 0
-            query = JournalQuery(self._next, kind, ANY_SUBJECT)
+            query = common.JournalQuery(self._next, kind, ANY_SUBJECT)
             try:
-                page, rows = await self._client.query(query, JournalPage, JournalAnswer, QUERY_ROWS)
+                page, rows = await self._client.query(
+                    query, common.JournalPage, common.JournalAnswer, common.QUERY_ROWS
+                )
             except RequestRefusedError as error:
                 if error.exception_code not in NO_ROLE:
                     raise
                 self.limited = True
             else:
-                return page, [Event(*row) for row in rows[: page.found]]
-        self.page = page = await self._client.read(JournalPage)
+                return page, [common.Event(*row) for row in rows[: page.found]]
+        self.page = page = await self._client.read(common.JournalPage)
         first = max(self._next, page.newest - self._most + 1)
-        kept = await read_ring(self._client, Event, EVENT_ROWS, first, page.newest)
+        kept = await read_ring(self._client, common.Event, common.EVENT_ROWS, first, page.newest)
         events = sorted(event for event in kept if event.number >= first)  # newer ones may have come meanwhile
         newest = max([page.newest, *(event.number for event in events)])
-        return JournalPage(max(page.oldest, newest - EVENT_ROWS + 1), newest, len(events)), events
+        return common.JournalPage(max(page.oldest, newest - common.EVENT_ROWS + 1), newest, len(events)), events

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from coldloop.errors import LoadFileError
-from coldloop.process.declaration import LAST_TICK, Process
-from coldloop.process.sections import LOAD_IN_WATTS
+from coldloop.process import declaration, sections
 from coldloop.table import TIME, Table, read_table, table_of
 
 
@@ -30,8 +29,8 @@ class LoadProfile:
             raise ValueError("a load profile needs a load for each time, the first at tick 0")
         if any(later <= earlier for earlier, later in zip(self.times, self.times[1:], strict=False)):
             raise ValueError("the times of a load profile must increase")
-        if self.times[-1] > LAST_TICK:
-            raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {LAST_TICK}")
+        if self.times[-1] > declaration.LAST_TICK:
+            raise ValueError(f"tick {self.times[-1]} is after the last one of a session, {declaration.LAST_TICK}")
         if not all(map(math.isfinite, self.watts)):
             raise ValueError("loads must be finite")
 
@@ -40,35 +39,37 @@ class LoadProfile:
         return self.watts[bisect_right(self.times, tick) - 1]
 
 
-def read_load_file(path: Path, process: Process) -> LoadProfile:
+def read_load_file(path: Path, process: declaration.Process) -> LoadProfile:
     """Return the load of a CSV file with the columns time_s and load_w, or load in another unit, steps held.
 
     Raises:
         LoadFileError: One line that names file, line and remedy.
     """
-    columns = (TIME, process.load.column, LOAD_IN_WATTS)
+    columns = (TIME, process.load.column, sections.LOAD_IN_WATTS)
     return _profile(read_table(path, columns, "name a readable CSV file", LoadFileError), process)
 
 
-def load_profile_of(text: str, where: str, process: Process) -> LoadProfile:
+def load_profile_of(text: str, where: str, process: declaration.Process) -> LoadProfile:
     """Return the load in a CSV text; `where` names it in messages.
 
     Raises:
         LoadFileError: One line that names place, line and remedy.
     """
-    return _profile(table_of(text, where, (TIME, process.load.column, LOAD_IN_WATTS), LoadFileError), process)
+    return _profile(table_of(text, where, (TIME, process.load.column, sections.LOAD_IN_WATTS), LoadFileError), process)
 
 
-def _profile(table: Table, process: Process) -> LoadProfile:
+def _profile(table: Table, process: declaration.Process) -> LoadProfile:
     own = process.load.column
-    column = own if table.place(own) is not None or table.place(LOAD_IN_WATTS) is None else LOAD_IN_WATTS
+    column = (
+        own if table.place(own) is not None or table.place(sections.LOAD_IN_WATTS) is None else sections.LOAD_IN_WATTS
+    )
     ticks: list[int] = []
     loads = table.columns([TIME, column])
     tick_s, unit, (low, high) = process.tick_s, process.load.unit, process.load.stored_span
     for (line, _), time, load in zip(table.rows, *loads, strict=True):
         where = f"{table.where}, line {line}"
-        if not 0 <= time < LAST_TICK * tick_s:
-            raise LoadFileError(f"{where}: {time:g} s is outside 0 to {LAST_TICK * tick_s:g} s")
+        if not 0 <= time < declaration.LAST_TICK * tick_s:
+            raise LoadFileError(f"{where}: {time:g} s is outside 0 to {declaration.LAST_TICK * tick_s:g} s")
         if not low <= load <= high:
             raise LoadFileError(f"{where}: {load:g} {unit} is outside {low:g} to {high:g} {unit}")
         tick = round(time / tick_s)

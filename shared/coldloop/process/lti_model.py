@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from pydantic import Field, TypeAdapter, ValidationError
 
 from coldloop.errors import ModelFileError
-from coldloop.process.cold_box import COLD_BOX as THE_COLD_BOX
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 from coldloop.text import parsed_json, read_bytes, whole_text
 
 FORMAT = 1
@@ -54,9 +53,9 @@ class ModelDescription:
     """SHA-256 of the process file that it was made from, and of the files that this names; empty: of none."""
 
     @property
-    def declared(self) -> Process:
+    def declared(self) -> declaration.Process:
         """The process that the plant is (KeyError, TypeError, ValueError: the file says something else there)."""
-        return Process.model_validate(self.process) if self.process else THE_COLD_BOX
+        return declaration.Process.model_validate(self.process) if self.process else cold_box.COLD_BOX
 
     def short_digest_of(self, digest: str) -> int:
         """Return the first 32 bits of the declaration's digest, or of the model's own where it has none."""
@@ -93,7 +92,7 @@ def read_header(path: Path) -> ModelHeader:
     return header_of(read_document(path), path)
 
 
-def declared_process(document: Mapping[str, Any], path: Path) -> Process:
+def declared_process(document: Mapping[str, Any], path: Path) -> declaration.Process:
     """Return the process of a document that `read_document` has verified: the cold box if it declares none.
 
     Raises:
@@ -102,18 +101,18 @@ def declared_process(document: Mapping[str, Any], path: Path) -> Process:
     return process_in(document.get("process", {}), f"{path}: process", PROCESS_REMEDY)
 
 
-def process_in(declared: Mapping[str, Any], where: str, remedy: str) -> Process:
+def process_in(declared: Mapping[str, Any], where: str, remedy: str) -> declaration.Process:
     """Return the process that is declared, the cold box if none is; `where` and `remedy` are for the message.
 
     Raises:
         ModelFileError: It is none that this version makes.
     """
     if not declared:
-        return THE_COLD_BOX
+        return cold_box.COLD_BOX
     if "decision_instants" in declared:
         raise ModelFileError(f"{where}: of version 0.3 or earlier, which declared it in another form; {remedy}")
     try:
-        return Process.model_validate(declared)
+        return declaration.Process.model_validate(declared)
     except ValidationError as error:
         first = error.errors()[0]
         place = ".".join(map(str, first["loc"]))

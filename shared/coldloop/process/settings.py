@@ -19,20 +19,18 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from pydantic_core import CoreSchema, to_jsonable_python
 from pydantic_core.core_schema import no_info_after_validator_function
 
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
-from coldloop.process.lti_model import declared_process, read_document
+from coldloop.process import cold_box, declaration, lti_model
 
 _DATA: Final = Path(__file__).parent / "data"
 SHIPPED_MODELS: Final = {"cold-box": _DATA / "cold_box_model.json", "refrigerator": _DATA / "refrigerator_model.json"}
 """Models that have a name: of the cold box alone, and of the refrigerator with its pressure loop closed."""
 DEFAULT_MODEL_FILE: Final = SHIPPED_MODELS["cold-box"]
 _MODEL: Final[ContextVar[Path]] = ContextVar("model file of settings", default=DEFAULT_MODEL_FILE)
-_PROCESS: Final[ContextVar[Process]] = ContextVar("process of settings", default=COLD_BOX)
+_PROCESS: Final[ContextVar[declaration.Process]] = ContextVar("process of settings", default=cold_box.COLD_BOX)
 
 
 @contextmanager
-def settings_of(process: Process) -> Iterator[None]:
+def settings_of(process: declaration.Process) -> Iterator[None]:
     """Make settings for a process within the context."""
     token = _PROCESS.set(process)
     try:
@@ -56,7 +54,7 @@ def model_named(file: Path) -> Iterator[None]:
         _MODEL.reset(token)
 
 
-def settings_process() -> Process:
+def settings_process() -> declaration.Process:
     """Return the process that settings are made for here."""
     return _PROCESS.get()
 
@@ -70,7 +68,7 @@ def made_by(make: Callable[[], Any]) -> Any:  # noqa: ANN401 the default of any 
     return Field(default_factory=make, json_schema_extra=show)
 
 
-def declared(of: Callable[[Process], Any]) -> Any:  # noqa: ANN401 as above
+def declared(of: Callable[[declaration.Process], Any]) -> Any:  # noqa: ANN401 as above
     """Return a field whose default is what `of` finds in the process."""
     return made_by(lambda: of(_PROCESS.get()))
 
@@ -84,9 +82,9 @@ def stretched(seconds: float, least: float = 0.0) -> Any:  # noqa: ANN401 as abo
 class Checked:
     """Check of a value by the process, after its type's own, and what the JSON schema shows of it."""
 
-    check: Callable[[Process, Any], None]
+    check: Callable[[declaration.Process, Any], None]
     """Raises ValueError."""
-    shown: Callable[[Process], dict[str, Any]]
+    shown: Callable[[declaration.Process], dict[str, Any]]
 
     def __get_pydantic_core_schema__(self, source: Any, handler: pydantic.GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
         """Check what the type lets pass."""
@@ -104,10 +102,10 @@ class Checked:
         return {**handler(schema), **self.shown(_PROCESS.get())}
 
 
-def within(bounds: Callable[[Process], tuple[float, float]]) -> Checked:
+def within(bounds: Callable[[declaration.Process], tuple[float, float]]) -> Checked:
     """Return a check that a number is within bounds that the process has."""
 
-    def check(process: Process, value: float) -> None:
+    def check(process: declaration.Process, value: float) -> None:
         low, high = bounds(process)
         if not value >= low:
             raise ValueError(f"input should be greater than or equal to {low:g}")
@@ -117,18 +115,18 @@ def within(bounds: Callable[[Process], tuple[float, float]]) -> Checked:
     return Checked(check, lambda process: dict(zip(("minimum", "maximum"), bounds(process), strict=True)))
 
 
-def one_of(what: str, names: Callable[[Process], tuple[str, ...]]) -> Checked:
+def one_of(what: str, names: Callable[[declaration.Process], tuple[str, ...]]) -> Checked:
     """Return a check that a name is one of those that the process has."""
 
-    def check(process: Process, name: str) -> None:
+    def check(process: declaration.Process, name: str) -> None:
         if name not in names(process):
             raise ValueError(f"unknown {what} {name}")
 
     return Checked(check, lambda process: {"enum": list(names(process))})
 
 
-def _each(what: str, names: Callable[[Process], tuple[str, ...]]) -> Checked:
-    def check(process: Process, values: tuple[float, ...]) -> None:
+def _each(what: str, names: Callable[[declaration.Process], tuple[str, ...]]) -> Checked:
+    def check(process: declaration.Process, values: tuple[float, ...]) -> None:
         if len(values) != len(names(process)):
             known = ", ".join(names(process))
             raise ValueError(f"give {len(names(process))} numbers, one for each {what}: {known}")
@@ -149,10 +147,10 @@ class ProcessSettings(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    _process: Process = pydantic.PrivateAttr(default_factory=settings_process)
+    _process: declaration.Process = pydantic.PrivateAttr(default_factory=settings_process)
 
     @property
-    def process(self) -> Process:
+    def process(self) -> declaration.Process:
         """The process that it is made for."""
         return self._process
 
@@ -241,14 +239,14 @@ class RootSettings(ProcessSettings):
             return handler(values)
 
 
-def process_of(path: Path) -> Process:
+def process_of(path: Path) -> declaration.Process:
     """Return the process of a model file (ModelFileError: the file cannot be read, or its process is none)."""
     if path in SHIPPED_MODELS.values():
-        return COLD_BOX
+        return cold_box.COLD_BOX
     found = path.stat() if path.exists() else None
     return _process_of(path, (found.st_mtime_ns, found.st_size, found.st_ino) if found else None)
 
 
 @lru_cache(maxsize=8)
-def _process_of(path: Path, _version: object) -> Process:
-    return declared_process(read_document(path), path)
+def _process_of(path: Path, _version: object) -> declaration.Process:
+    return lti_model.declared_process(lti_model.read_document(path), path)

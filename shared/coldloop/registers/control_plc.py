@@ -4,20 +4,8 @@ from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK, Process
+from coldloop.registers import common
 from coldloop.registers import declaration as reg
-from coldloop.registers.common import (
-    IDENTITY_BLOCK,
-    LAST_BLOCKS,
-    STATISTICS_BLOCK,
-    Alarm,
-    AlarmCommand,
-    LeaseStatus,
-    SessionPace,
-    TimeBaseKind,
-    WatchdogStatus,
-    WatchdogTime,
-    alarms_of,
-)
 from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 from coldloop.registers.plant import MAX_STATE
 
@@ -316,7 +304,7 @@ class ControlSession(NamedTuple):
     """Starts a session when written."""
 
     session: Annotated[int, reg.u32("Number of the session; the control PLC restarts from tick 0", low=1)]
-    realtime: Annotated[int, reg.u16("{}", high=1, values=TimeBaseKind)]
+    realtime: Annotated[int, reg.u16("{}", high=1, values=common.TimeBaseKind)]
     factor: Annotated[float, reg.f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
 
 
@@ -330,26 +318,27 @@ class Grant(NamedTuple):
 def control_map(process: Process) -> RegisterMap:
     """Return the map of the control PLC of a process."""
     blocks = (
-        IDENTITY_BLOCK, Block("status", 30, Status, "Sequence player and scan cycle"),
-        Block("ladder", 50, LadderStatus, "The fail-safe ladder"), STATISTICS_BLOCK,
+        common.IDENTITY_BLOCK, Block("status", 30, Status, "Sequence player and scan cycle"),
+        Block("ladder", 50, LadderStatus, "The fail-safe ladder"), common.STATISTICS_BLOCK,
         Block("process", 100, ProcessNow, "The process at the last scan"),
         Block("update", 200, Update, "Latched at the last updating instant", sealed=True),
         Block("plant link", 330, PlantLinkStatus, "Link to the rack, and the clocks of both"),
-        Block("optimiser lease", 360, LeaseStatus, "Who may write as the optimiser"),
+        Block("optimiser lease", 360, common.LeaseStatus, "Who may write as the optimiser"),
         Block("await update", 400, AwaitUpdate, "Makes a read of the latch wait", Role.OPTIMIZER, sealed=True),
         Block("plan", 408, Plan, "Decided updating period", Role.OPTIMIZER, sealed=True),
         Block("acknowledgement", 420, Acknowledgement, "Answer to the last sequence", sealed=True),
         Block("heartbeat", 430, Heartbeat, "Heartbeat of the optimiser", Role.OPTIMIZER, sealed=True),
-        Block("watchdog", 440, WatchdogStatus, "Watches the optimiser"),
-        Block("watchdog time", 446, WatchdogTime, "Sets that watchdog", Role.OPERATOR),
+        Block("watchdog", 440, common.WatchdogStatus, "Watches the optimiser"),
+        Block("watchdog time", 446, common.WatchdogTime, "Sets that watchdog", Role.OPERATOR),
         Block("session", 450, ControlSession, "Start of a session", Role.OPERATOR),
         Block("grant", 460, Grant, "Ticks granted in lock-step", Role.OPERATOR),
         Block("latched update", 462, LatchedUpdate, "The newest update", sealed=True),
         Block("operator", 470, Operator, "Operating mode and manual setpoints", Role.OPERATOR),
-        Block("alarm command", 480, AlarmCommand, "Command for an alarm", Role.OPERATOR),
+        Block("alarm command", 480, common.AlarmCommand, "Command for an alarm", Role.OPERATOR),
         Block("sequence header", 488, SequenceHeader, "Commits the sequence in the buffer", Role.OPTIMIZER),
         Block("sequence", 500, SequenceRow, "Spare buffer for a sequence", Role.OPTIMIZER, SEQUENCE_ROWS),
-        Block("pace", 1950, SessionPace, "Time base of the present session", Role.OPERATOR),
-        Block("alarms", 2000, Alarm, "One row for each alarm", rows=len(alarms_of(process))), *LAST_BLOCKS,
+        Block("pace", 1950, common.SessionPace, "Time base of the present session", Role.OPERATOR),
+        Block("alarms", 2000, common.Alarm, "One row for each alarm", rows=len(common.alarms_of(process))),
+        *common.LAST_BLOCKS,
     )  # fmt: skip
     return RegisterMap(service="control_plc", version=4, blocks=reg.placed(process, blocks))

@@ -15,8 +15,7 @@ from enum import Enum, IntEnum, StrEnum
 from functools import cache, cached_property, partial
 from typing import NamedTuple, Self, TypeAlias, cast, get_type_hints
 
-from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.declaration import Process
+from coldloop.process import cold_box, declaration
 
 
 class Kind(Enum):
@@ -138,7 +137,7 @@ def text(description: str, words: int) -> Field:
 
 Numbers: TypeAlias = tuple[float, ...]
 """Values of an array."""
-Declared: TypeAlias = Field | Callable[[Process], Field]
+Declared: TypeAlias = Field | Callable[[declaration.Process], Field]
 """A declaration, or what it is for a process."""
 
 
@@ -150,7 +149,7 @@ def in_ticks(field: Field) -> Declared:
 def of_load(description: str, *, in_span: bool = False, low: float | None = None, finite: bool = True) -> Declared:
     """Declare a value in the unit of the load: `{noun}` and `{word}` are what the load is called, `{name}` its name."""
 
-    def declared(process: Process) -> Field:
+    def declared(process: declaration.Process) -> Field:
         load = process.load
         least, largest = load.span if in_span else (low, None)
         words = description.format(noun=load.noun, name=load.name, word=load.word or load.name)
@@ -163,7 +162,7 @@ def _of_each(
     signals: str, description: str, *, low: float | None = None, high: float | None = None, finite: bool = True,
     unit: str | None = None, in_span: bool = False,
 ) -> Declared:  # fmt: skip
-    def declared(process: Process) -> Field:
+    def declared(process: declaration.Process) -> Field:
         each = getattr(process, signals)
         names, units = tuple(one.name for one in each), tuple(one.unit if unit is None else unit for one in each)
         least, largest = process.span_of_inputs if in_span else (low, high)
@@ -185,7 +184,7 @@ of_banded = partial(_of_each, "banded")
 def each_input(description: str, *, in_span: bool = True) -> Declared:
     """Declare a register for each input, of its own name, span and meaning, which `{}` stands for."""
 
-    def declared(process: Process) -> Field:
+    def declared(process: declaration.Process) -> Field:
         inputs = process.inputs
         return Field(
             Kind.F32, description.format("Input"), elements=tuple(one.tag for one in inputs),
@@ -201,7 +200,7 @@ def each_input(description: str, *, in_span: bool = True) -> Declared:
 
 
 @cache
-def fields_of(record: type[tuple[object, ...]], process: Process = COLD_BOX) -> dict[str, Field]:
+def fields_of(record: type[tuple[object, ...]], process: declaration.Process = cold_box.COLD_BOX) -> dict[str, Field]:
     """Return the declared fields of a record class for a process, in their order."""
     declared: dict[str, Field] = {}
     for name, hint in get_type_hints(record, include_extras=True).items():
@@ -245,7 +244,7 @@ class Block:
     rows: int = 1
     sealed: bool = False
     """Each row ends with the CRC-32 of the words before it (`coldloop.registers.codec`)."""
-    process: Process = COLD_BOX
+    process: declaration.Process = cold_box.COLD_BOX
     """Process that sizes, names, units and ranges are of."""
 
     def __hash__(self) -> int:
@@ -291,7 +290,7 @@ class Block:
             address += field.kind.words
 
 
-def placed(process: Process, blocks: Iterable[Block]) -> tuple[Block, ...]:
+def placed(process: declaration.Process, blocks: Iterable[Block]) -> tuple[Block, ...]:
     """Return the blocks of a process, at their addresses, or after a longer one before them."""
     found: list[Block] = []
     for block in blocks:
@@ -321,7 +320,7 @@ class RegisterMap:
             end = block.end
 
     @property
-    def process(self) -> Process:
+    def process(self) -> declaration.Process:
         """The process that it is for."""
         return self.blocks[0].process
 

@@ -4,8 +4,8 @@ from functools import cache
 from typing import Annotated, Final, NamedTuple
 
 from coldloop.process.declaration import Process
+from coldloop.registers import common
 from coldloop.registers import declaration as reg
-from coldloop.registers.common import IDENTITY_BLOCK, LAST_BLOCKS, STATISTICS_BLOCK, SessionPace, TimeBaseKind
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 
@@ -39,7 +39,7 @@ class OptimizerSession(NamedTuple):
     """Settings of a session, taken when its first update arrives."""
 
     session: Annotated[int, reg.u32("Number of the session", low=1)]
-    realtime: Annotated[int, reg.u16("{}: answers are delayed as by the PLC", high=1, values=TimeBaseKind)]
+    realtime: Annotated[int, reg.u16("{}: answers are delayed as by the PLC", high=1, values=common.TimeBaseKind)]
     factor: Annotated[float, reg.f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     updating_period: Annotated[
         int,
@@ -178,13 +178,13 @@ class ModelDeviation(NamedTuple):
 def optimizer_map(process: Process) -> RegisterMap:
     """Return the map of the optimiser of a process."""
     blocks = (
-        IDENTITY_BLOCK, Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
-        Block("control link", 40, ControlLinkStatus, "Link to the control PLC"), STATISTICS_BLOCK,
-        Block("pace", 100, SessionPace, "Time base of the present session", Role.OPERATOR),
+        common.IDENTITY_BLOCK, Block("session", 30, OptimizerSession, "Settings of the next session", Role.OPERATOR),
+        Block("control link", 40, ControlLinkStatus, "Link to the control PLC"), common.STATISTICS_BLOCK,
+        Block("pace", 100, common.SessionPace, "Time base of the present session", Role.OPERATOR),
         Block("updating rule", 120, UpdatingRuleStatus, "What decides the updating period"),
         Block("operating limits", 140, OperatingLimits, "Bands of the outputs, bounds and rates of the inputs"),
         Block("prediction", 200, Prediction, "Predicted result of the last sequence", sealed=True),
         Block("model deviation", 320, ModelDeviation, "How the plant differs from the prediction model"),
-        Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS), *LAST_BLOCKS,
+        Block("history", 16384, Optimization, "The last updates", rows=HISTORY_ROWS), *common.LAST_BLOCKS,
     )  # fmt: skip
     return RegisterMap(service="optimizer_plc", version=4, blocks=reg.placed(process, blocks))

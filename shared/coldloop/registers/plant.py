@@ -6,19 +6,9 @@ from functools import cache
 from itertools import accumulate, pairwise
 from typing import Annotated, Final, NamedTuple
 
-from coldloop.process.cold_box import STATION_SIGNAL_NAMES, STATION_SIGNAL_UNITS, STATION_VALVE_NAMES
-from coldloop.process.declaration import LAST_TICK, Process
+from coldloop.process import cold_box, declaration
+from coldloop.registers import common
 from coldloop.registers import declaration as reg
-from coldloop.registers.common import (
-    IDENTITY_BLOCK,
-    LAST_BLOCKS,
-    STATISTICS_BLOCK,
-    LeaseStatus,
-    SessionPace,
-    TimeBaseKind,
-    WatchdogStatus,
-    WatchdogTime,
-)
 from coldloop.registers.declaration import Block, Numbers, RegisterMap, Role, Worded
 
 HISTORY_ROWS: Final = 256
@@ -57,7 +47,8 @@ class Actuators(NamedTuple):
     """
 
     tick: Annotated[
-        int, reg.u32("Tick of these outputs; in lock-step the present one advances the plant", high=LAST_TICK)
+        int,
+        reg.u32("Tick of these outputs; in lock-step the present one advances the plant", high=declaration.LAST_TICK),
     ]
     u: Annotated[Numbers, reg.each_input("{}")]
     session: Annotated[int, reg.u32("Session of these outputs")]
@@ -72,7 +63,7 @@ class Measurement(NamedTuple):
     Load, outputs and states may be any number, or NaN: sensors fail, and the control PLC works without them.
     """
 
-    tick: Annotated[int, reg.u32("Tick at which these values were read", high=LAST_TICK)]
+    tick: Annotated[int, reg.u32("Tick at which these values were read", high=declaration.LAST_TICK)]
     load: Annotated[float, reg.of_load("{noun} {name}, which is known", finite=False)]
     y: Annotated[Numbers, reg.of_outputs("Measured output", finite=False)]
     x: Annotated[Numbers, reg.of_states("Simulated state, not measured", finite=False)]
@@ -110,7 +101,7 @@ class PlantSession(NamedTuple):
     """Starts a simulation session when written."""
 
     session: Annotated[int, reg.u32("Number of the session; the simulation restarts from tick 0", low=1)]
-    realtime: Annotated[int, reg.u16("{}", high=1, values=TimeBaseKind)]
+    realtime: Annotated[int, reg.u16("{}", high=1, values=common.TimeBaseKind)]
     factor: Annotated[float, reg.f32("Seconds of plant time in one second of real time", low=0.01, high=10_000)]
     seed: Annotated[int, reg.u32("Seed of the sensor noise")]
     load_steps: Annotated[int, reg.u16("Rows of the load table that are in use", low=1, high=LOAD_ROWS)]
@@ -119,7 +110,7 @@ class PlantSession(NamedTuple):
 class LoadStep(NamedTuple):
     """One step of the load table, held until the next one."""
 
-    tick: Annotated[int, reg.in_ticks(reg.u32("First tick of the step", high=LAST_TICK))]
+    tick: Annotated[int, reg.in_ticks(reg.u32("First tick of the step", high=declaration.LAST_TICK))]
     watts: Annotated[float, reg.of_load("{noun}", in_span=True)]
 
 
@@ -139,7 +130,9 @@ class LoadStatus(NamedTuple):
 class LiveLoad(NamedTuple):
     """Changes the heat load of the session under way; what was known of later ticks is dropped."""
 
-    tick: Annotated[int, reg.in_ticks(reg.u32("First tick, in the future; 0 is the next tick", high=LAST_TICK))] = 0
+    tick: Annotated[
+        int, reg.in_ticks(reg.u32("First tick, in the future; 0 is the next tick", high=declaration.LAST_TICK))
+    ] = 0
     watts: Annotated[float, reg.of_load("{noun}", in_span=True)] = 0.0
     crc: Annotated[int, reg.u32("CRC-32 of the registers before; 0 is none, a wrong one is refused")] = 0
 
@@ -148,7 +141,7 @@ class LoadAhead(NamedTuple):
     """Steps of the heat load that are to come, for loads of any length; what was known from the first on is dropped."""
 
     session: Annotated[int, reg.u32("Session of these steps")] = 0
-    tick: Annotated[int, reg.in_ticks(reg.u32("Tick of the first step, in the future", high=LAST_TICK))] = 0
+    tick: Annotated[int, reg.in_ticks(reg.u32("Tick of the first step, in the future", high=declaration.LAST_TICK))] = 0
     length: Annotated[int, reg.u16("Steps in use", low=1, high=AHEAD_STEPS)] = 1
     watts: Annotated[
         Numbers,
@@ -192,8 +185,8 @@ class LoadAhead(NamedTuple):
         if not all(self.ticks[: self.length - 1]):
             raise ValueError("a step lasts one tick or more")
         starts = list(accumulate(self.ticks[: self.length - 1], initial=self.tick))
-        if starts[-1] > LAST_TICK:
-            raise ValueError(f"tick {starts[-1]} is after the last one of a session, {LAST_TICK}")
+        if starts[-1] > declaration.LAST_TICK:
+            raise ValueError(f"tick {starts[-1]} is after the last one of a session, {declaration.LAST_TICK}")
         return [LoadStep(*step) for step in zip(starts, self.watts, strict=False)]
 
 
@@ -249,8 +242,10 @@ class StationAlarm(IntFlag):
     """The low pressure has stopped a compressor; held until that is switched off."""
 
 
-_WARM_SIGNALS: Final = reg.f32("Warm signal", elements=STATION_SIGNAL_NAMES, units=STATION_SIGNAL_UNITS, finite=False)
-_WARM_VALVES: Final = reg.f32("Requested opening of valve", elements=STATION_VALVE_NAMES, units=("%",) * 4)
+_WARM_SIGNALS: Final = reg.f32(
+    "Warm signal", elements=cold_box.STATION_SIGNAL_NAMES, units=cold_box.STATION_SIGNAL_UNITS, finite=False
+)
+_WARM_VALVES: Final = reg.f32("Requested opening of valve", elements=cold_box.STATION_VALVE_NAMES, units=("%",) * 4)
 
 
 class StationSample(NamedTuple):
@@ -275,8 +270,8 @@ class StationStatus(NamedTuple):
     tick: Annotated[int, reg.u32("Tick at which these values were read")] = 0
     mode: Annotated[int, reg.u16("As in the station history")] = StationMode.AUTOMATIC
     alarms: Annotated[int, reg.u16("As in the station history")] = 0
-    signals: Annotated[Numbers, _WARM_SIGNALS] = (0.0,) * len(STATION_SIGNAL_NAMES)
-    commands: Annotated[Numbers, _WARM_VALVES] = (0.0,) * len(STATION_VALVE_NAMES)
+    signals: Annotated[Numbers, _WARM_SIGNALS] = (0.0,) * len(cold_box.STATION_SIGNAL_NAMES)
+    commands: Annotated[Numbers, _WARM_VALVES] = (0.0,) * len(cold_box.STATION_VALVE_NAMES)
     acting: Annotated[Numbers, reg.of_inputs("Acting on the cold box, whatever is asked")] = (0.0,) * 3
 
 
@@ -322,19 +317,21 @@ OF_A_REFRIGERATOR: Final = (StationStatus, StationSample, Surroundings, ModelRan
 
 
 @cache
-def plant_map(process: Process) -> RegisterMap:
+def plant_map(process: declaration.Process) -> RegisterMap:
     """Return the map of the rack of a process."""
     noun, outputs, operator = process.load.noun, len(process.outputs), Role.OPERATOR
     blocks = (
-        IDENTITY_BLOCK,
-        STATISTICS_BLOCK,
+        common.IDENTITY_BLOCK,
+        common.STATISTICS_BLOCK,
         Block("actuators", 100, Actuators, "Outputs of the control PLC", Role.CONTROL, sealed=True),
         Block("measurement", 200, Measurement, "Inputs of the control PLC", sealed=True),
-        Block("watchdog", 330, WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"),
-        Block("watchdog time", 340, WatchdogTime, "Sets that watchdog", Role.CONTROL),
-        Block("lease", 350, LeaseStatus, "Who may write outputs"),
+        Block(
+            "watchdog", 330, common.WatchdogStatus, "Watches the control PLC; applies the safe state when it expires"
+        ),
+        Block("watchdog time", 340, common.WatchdogTime, "Sets that watchdog", Role.CONTROL),
+        Block("lease", 350, common.LeaseStatus, "Who may write outputs"),
         Block("session", 400, PlantSession, "Start of a simulation session", operator),
-        Block("pace", 410, SessionPace, "Time base of the present session", operator),
+        Block("pace", 410, common.SessionPace, "Time base of the present session", operator),
         Block("load status", 420, LoadStatus, f"The {noun.lower()} and its known steps"),
         Block("live load", 440, LiveLoad, f"{noun} from a tick on", operator, sealed=True),
         Block("sensor faults", 500, SensorFault, "Faults injected into the measured outputs", operator, outputs),
@@ -345,7 +342,7 @@ def plant_map(process: Process) -> RegisterMap:
         Block("load table", 1000, LoadStep, f"{noun} over the session", operator, LOAD_ROWS),
         Block("station history", 9200, StationSample, "The last ticks of the warm part", rows=STATION_ROWS),
         Block("history", 16384, PlantSample, "The last ticks", rows=HISTORY_ROWS),
-        *LAST_BLOCKS,
+        *common.LAST_BLOCKS,
     )
     unused = () if process.has_station else OF_A_REFRIGERATOR
     return RegisterMap(service="plant", version=4, blocks=reg.placed(process, blocks), unused=unused)

@@ -18,8 +18,7 @@ from typing import Any, Final
 
 from pydantic import BaseModel
 
-from coldloop.errors import ColdloopError
-from coldloop.text import parsed_json, replace_file
+from coldloop import errors, text
 
 MAGIC = "coldloop-retained"
 MOST_BYTES: Final = 2**26
@@ -34,7 +33,7 @@ CLOSING_S: Final = 2.0
 """How long the end of a program waits for the disk."""
 
 
-class RetainedStateError(ColdloopError):
+class RetainedStateError(errors.ColdloopError):
     """A retained state cannot be trusted, or cannot be written."""
 
 
@@ -67,7 +66,7 @@ def decoded(data: bytes, owner: str, digest: int) -> dict[str, Any]:
             complaint = "the retained state of another program or model"
         raise RetainedStateError(f"{complaint}; it is not used")
     try:
-        state = parsed_json(content)
+        state = text.parsed_json(content)
     except ValueError:
         raise RetainedStateError("it holds no valid state; it is not used") from None
     if not isinstance(state, dict):
@@ -104,7 +103,7 @@ class RetainedFile:
         if _is_device(self.path):
             raise RetainedStateError(f"{self.path}: a device; name another file in retain.file")
         try:
-            replace_file(self.path, encoded(state, self._owner, self._digest), synced=synced, alone=True)
+            text.replace_file(self.path, encoded(state, self._owner, self._digest), synced=synced, alone=True)
         except OSError as error:
             raise RetainedStateError(f"{self.path}: {error.strerror}; name another file in retain.file") from None
 

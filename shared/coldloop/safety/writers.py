@@ -18,11 +18,8 @@ from collections.abc import Sequence as Rows
 from itertools import chain
 from typing import Final, NamedTuple, TypeAlias
 
-from coldloop.registers.bank import BusyError, Caller
-from coldloop.registers.codec import codec_of, to_words
+from coldloop.registers import bank, codec, control_plc, declaration
 from coldloop.registers.common import WHO_WORDS, LeaseEvent, LeaseState, LeaseStatus
-from coldloop.registers.control_plc import SequenceHeader
-from coldloop.registers.declaration import Block
 
 LINGER_S: Final = 1.0
 """For how long, in real time, a holder whose connection has closed keeps its lease."""
@@ -54,11 +51,11 @@ class WriterLease:
         """Name of the holder, until the end of its lease has been noted."""
         self._refused_at: dict[int, float] = {}
         """Time at which each connection was last noted as a second writer."""
-        self._caller: Caller | None = None
+        self._caller: bank.Caller | None = None
         self._holder = SIMPLE_CLIENT
         self._heard_at = 0.0
         self._closed_at: float | None = None
-        self._others: dict[int, Caller] = {}
+        self._others: dict[int, bank.Caller] = {}
         """Open connections that the holder had before the present one; it has left them, unless the lease is shared."""
         self.refused = 0
         """Writes of others so far."""
@@ -80,7 +77,7 @@ class WriterLease:
             return LeaseState.HELD
         return LeaseState.LINGERING if now - self._closed_at <= LINGER_S else LeaseState.FREE
 
-    def check(self, caller: Caller, holder: int | None = None) -> None:
+    def check(self, caller: bank.Caller, holder: int | None = None) -> None:
         """Check that a caller may write; `holder` is the number that it says it has, None where it does not say.
 
         Raises:
@@ -97,9 +94,9 @@ class WriterLease:
         if before is None or now - before >= REPEATED_AFTER_S:
             self._refused_at[caller.connection] = now
             self._note(LeaseEvent.REFUSED, caller.name)
-        raise BusyError(f"{held.name} holds the lease of {self._what}")
+        raise bank.BusyError(f"{held.name} holds the lease of {self._what}")
 
-    def take(self, caller: Caller, holder: int | None = None) -> bool:
+    def take(self, caller: bank.Caller, holder: int | None = None) -> bool:
         """Give the lease to a client that `check` has let pass, or renew it; return whether it has a new holder."""
         held, state = self._caller, self.state
         if held is caller and state is LeaseState.HELD and holder in (None, self._holder) and self._name == caller.name:
@@ -124,7 +121,7 @@ class WriterLease:
         self._name = caller.name
         return new
 
-    def closed(self, caller: Caller) -> bool:
+    def closed(self, caller: bank.Caller) -> bool:
         """Note that a connection has closed; return whether it held the lease, which a simple client gives up."""
         self._refused_at.pop(caller.connection, None)
         self._others.pop(caller.connection, None)
@@ -151,28 +148,28 @@ class WriterLease:
         state, held, refused = self.state, self._caller, self.refused & 0xFFFFFFFF
         if state is LeaseState.FREE or held is None:
             return LeaseStatus(refused=refused)
-        return LeaseStatus(state, self._holder, refused, to_words(held.name, WHO_WORDS))
+        return LeaseStatus(state, self._holder, refused, codec.to_words(held.name, WHO_WORDS))
 
 
 Inputs: TypeAlias = tuple[float, ...]
 """Inputs of one tick, in their order."""
-_HEADER = codec_of(Block("sequence header", 0, SequenceHeader, ""))
+_HEADER = codec.codec_of(declaration.Block("sequence header", 0, control_plc.SequenceHeader, ""))
 _CRC_BYTES = 4
 
 
 class InputSequence(NamedTuple):
     """A header and its rows, one row a tick."""
 
-    header: SequenceHeader
+    header: control_plc.SequenceHeader
     rows: Rows[Inputs]
 
 
-def checksum(header: SequenceHeader, rows: Rows[Inputs]) -> int:
+def checksum(header: control_plc.SequenceHeader, rows: Rows[Inputs]) -> int:
     """Return the CRC-32 of header (without its CRC) and rows, whatever the word order of the link."""
     crc = zlib.crc32(_HEADER.encode(header)[:-_CRC_BYTES])
     return zlib.crc32(struct.pack(f">{len(rows[0]) * len(rows) if rows else 0}f", *chain.from_iterable(rows)), crc)
 
 
-def with_checksum(header: SequenceHeader, rows: Rows[Inputs]) -> InputSequence:
+def with_checksum(header: control_plc.SequenceHeader, rows: Rows[Inputs]) -> InputSequence:
     """Return the sequence with its CRC filled in."""
     return InputSequence(header._replace(crc=checksum(header, rows)), rows)

@@ -24,11 +24,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, Self
 
 from pydantic import BaseModel, Field, PositiveFloat, field_validator, model_validator
 
-from coldloop import __version__
-from coldloop.errors import ConfigurationError, PortInUseError
+from coldloop import __version__, errors, text
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.declaration import Block
-from coldloop.text import finite_json, read_text
 
 if TYPE_CHECKING:
     import aiomqtt
@@ -87,7 +85,9 @@ class TelemetrySettings(BaseModel, frozen=True, extra="forbid"):
         """Return the password, if one is set (ConfigurationError: the file cannot be read)."""
         if self.password_file is None:
             return None
-        return read_text(self.password_file, "telemetry.password_file names it", ConfigurationError).rstrip("\r\n")
+        return text.read_text(self.password_file, "telemetry.password_file names it", errors.ConfigurationError).rstrip(
+            "\r\n"
+        )
 
 
 _NOT_IN_NAMES: Final = re.compile(r"[^a-zA-Z0-9_]+")
@@ -169,7 +169,7 @@ class MetricsServer:
         try:
             server = await asyncio.start_server(self._answer, host, port, limit=LONGEST_REQUEST, backlog=MOST_OPEN)
         except OSError as error:
-            raise PortInUseError(
+            raise errors.PortInUseError(
                 f"{host}:{port}: {error.strerror}; give another one to `metrics.port` of the service"
             ) from None
         async with server:
@@ -242,7 +242,7 @@ class Telemetry:
 
     async def _sample(self) -> None:
         while True:
-            self._waiting.append(finite_json(self._snapshot()))
+            self._waiting.append(text.finite_json(self._snapshot()))
             self._arrived.set()
             await asyncio.sleep(self._settings.period_s)
 

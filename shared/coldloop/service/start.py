@@ -23,9 +23,7 @@ from typing import Any, Final, TextIO, TypeVar
 
 from pydantic import BaseModel
 
-from coldloop import __version__
-from coldloop.config import load_configuration
-from coldloop.errors import ColdloopError
+from coldloop import __version__, config, errors
 from coldloop.kernels.cache import announce_with
 from coldloop.service import add_configuration_options
 
@@ -243,12 +241,12 @@ def main(name: str, settings: type[S], serve: Callable[[S], Awaitable[None]], ar
     announce_with(lambda one: log.info(COMPILING, extra={"kernels": one.owner, "about_s": one.about_s}))
     code, last_line = 1, None
     try:
-        configuration = load_configuration(
+        configuration = config.load_configuration(
             settings, file=options.config, assignments=options.assignments, others=SECTIONS,
             options={"model.file": (options.process, "--process")} if options.process else {},
         )  # fmt: skip
         code = run_event_loop(lambda: _until_stopped(serve(configuration.settings), with_parent=options.with_parent))
-    except ColdloopError as error:
+    except errors.ColdloopError as error:
         code, last_line = error.exit_code, f"{name}: {error}"
     except Exception:  # the interpreter would write it past the queue, and block on its reader
         log.exception("failed")
@@ -261,7 +259,7 @@ def in_one_line(name: str, start: Callable[[], int]) -> int:
     """Return what `start` returns, which imports a service and runs it; an error there is reported in one line."""
     try:
         return start()
-    except ColdloopError as error:
+    except errors.ColdloopError as error:
         sys.stderr.write(f"{name}: {error}\n")
         return error.exit_code
 
@@ -294,7 +292,7 @@ async def _until_stopped(service: Awaitable[None], *, with_parent: bool) -> int:
     except asyncio.CancelledError:
         return 0
     except BaseExceptionGroup as group:
-        cause: BaseException | None = group.subgroup(ColdloopError)
+        cause: BaseException | None = group.subgroup(errors.ColdloopError)
         while isinstance(cause, BaseExceptionGroup):
             cause = cause.exceptions[0]
         raise (cause or group) from None

@@ -7,8 +7,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Final
 
-from coldloop.errors import UsageError
-from coldloop.service import add_configuration_options
+from coldloop import errors, service
 from coldloop_rig.cli.commands.options import configuration
 
 HEADING: Final = re.compile(r"^(#+) +(.+)$")
@@ -47,7 +46,7 @@ def _asked(asked: str, pages: Mapping[str, Path]) -> str:
     name, _, section = asked.removeprefix("docs/").partition("#")
     name = name.removesuffix(".md")
     if name not in pages:
-        raise UsageError(f"docs: no page '{name}'; there are {', '.join(pages)}")
+        raise errors.UsageError(f"docs: no page '{name}'; there are {', '.join(pages)}")
     text = pages[name].read_text(encoding="utf-8")
     if not section:
         return text
@@ -59,7 +58,7 @@ def _asked(asked: str, pages: Mapping[str, Path]) -> str:
                 last = next((line for line, other, _ in parts[place + 1 :] if other <= level), None)
                 return "\n".join(each.splitlines()[first:last]) + "\n"
     known = ", ".join(anchor(words) for *_, words in headings(text))
-    raise UsageError(f"docs: {name} has no section '{section}'; it has {known}")
+    raise errors.UsageError(f"docs: {name} has no section '{section}'; it has {known}")
 
 
 def headings(text: str) -> Iterator[tuple[int, int, str]]:
@@ -77,7 +76,7 @@ def anchor(words: str) -> str:
 
 
 def _declare_config(parser: argparse.ArgumentParser) -> None:
-    add_configuration_options(parser)
+    service.add_configuration_options(parser)
     parser.add_argument("--keys", action="store_true", help="list all keys and what they mean, as Markdown")
 
 

@@ -2,14 +2,18 @@
 
 import argparse
 import asyncio
+import contextlib
+import csv
+import re
 import signal
 import sys
-from collections.abc import Coroutine
+from collections.abc import Coroutine, Sequence
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, TextIO
 
-from coldloop.errors import UsageError
+from coldloop import errors
 from coldloop.process.updating_periods import LONGEST_TICKS
 from coldloop.service import add_configuration_options
 from coldloop_rig.cli.commands import options as common
@@ -17,22 +21,11 @@ from coldloop_rig.interruption import run_until_interrupted
 from coldloop_rig.text_tables import coloured, cut, fitted, width
 
 if TYPE_CHECKING:
-    from coldloop.process.declaration import Process
-    from coldloop_rig.live.status import Work
-    from coldloop_rig.settings import Settings
-import contextlib
-import csv
-import re
-from collections.abc import Sequence
-from datetime import UTC, datetime
-from typing import TYPE_CHECKING, TextIO
-
-from coldloop.errors import ResultsError
-
-if TYPE_CHECKING:
     from coldloop.modbus.settings import Endpoint
     from coldloop.process.declaration import Process
     from coldloop.registers.common import Event
+    from coldloop_rig.live.status import Work
+    from coldloop_rig.settings import Settings
 
 
 def _declare_up(parser: argparse.ArgumentParser) -> None:
@@ -61,7 +54,7 @@ def _declare_up(parser: argparse.ArgumentParser) -> None:
 def execute_up(options: argparse.Namespace) -> int:
     """The rig on fixed ports, in real time, until Ctrl-C."""
     common.check_load(options.load)
-    from coldloop_rig.live.started_rigs import check_ports, detached, lock_rig, ports_from
+    from coldloop_rig.live import started_rigs, up
     from coldloop_rig.runs.running import check_certificates, remarks
 
     effective = common.configuration(options)
@@ -69,23 +62,22 @@ def execute_up(options: argparse.Namespace) -> int:
     check_certificates(effective.settings)
     told = [] if options.without else remarks(effective)
     optimizer = common.exported(options.optimizer, effective.settings)
-    ports = ports_from(options.port_base)
-    lock = lock_rig(ports[0], options.locked)
-    check_ports(ports)
+    ports = started_rigs.ports_from(options.port_base)
+    lock = started_rigs.lock_rig(ports[0], options.locked)
+    started_rigs.check_ports(ports)
     page = options.page or options.page_port is not None
     if page:
         from coldloop_rig.live.up import check_page
 
         check_page(effective.settings.hmi)
     if options.detach and options.locked is None:
-        return detached(ports, lock)
+        return started_rigs.detached(ports, lock)
     from coldloop_rig.cosim.wiring import REQUIRED, SERVICES
-    from coldloop_rig.live.up import UpRig
 
     for line in told:
         common.tell(line)
     services = REQUIRED if options.without else SERVICES
-    rig = UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services,
+    rig = up.UpRig(effective.settings, ports, options.tls, page=page, cuttable=options.cuttable, services=services,
                 optimizer=optimizer)  # fmt: skip
     run_until_interrupted(lambda: rig.run(announce=not options.quiet))
     return 0
@@ -192,8 +184,7 @@ def execute_set(options: argparse.Namespace) -> int:
 
 
 async def _send(options: argparse.Namespace) -> None:
-    from coldloop.operating.commands import SetSetpoint, read_command
-    from coldloop.operating.execution import WORK, check_bounds, stream_load
+    from coldloop.operating import commands, execution
     from coldloop.process.load_profile import read_load_file
     from coldloop_rig.live.status import ask
 
@@ -202,12 +193,12 @@ async def _send(options: argparse.Namespace) -> None:
     services: tuple[str, ...] = ("plant",)
     if document is None:  # a load file, which is written without a time limit
         load = read_load_file(Path(options.new_load), process)
-        work: Work = partial(stream_load, load=load, tick=options.at, say=common.tell)
+        work: Work = partial(execution.stream_load, load=load, tick=options.at, say=common.tell)
     else:
-        command = read_command(document, process)
-        if isinstance(command, SetSetpoint):
-            check_bounds(command, limits.low[command.place], limits.high[command.place])
-        (services, execute), work = WORK[type(command)], lambda clients: execute(clients, command)
+        command = commands.read_command(document, process)
+        if isinstance(command, commands.SetSetpoint):
+            execution.check_bounds(command, limits.low[command.place], limits.high[command.place])
+        (services, execute), work = execution.WORK[type(command)], lambda clients: execute(clients, command)
     there = common.rig_services(options)
     concerned = [service for service in services if service in there]
     endpoints = common.rig_endpoints(options, settings)
@@ -224,7 +215,7 @@ def _load(options: argparse.Namespace) -> dict[str, object] | None:
     except ValueError:
         if not Path(options.new_load).is_file():
             unit = _unit(settings_process())
-            raise UsageError(f"load '{options.new_load}': neither {unit} nor a file") from None
+            raise errors.UsageError(f"load '{options.new_load}': neither {unit} nor a file") from None
         return None
 
 
@@ -236,7 +227,7 @@ def _acknowledgement(options: argparse.Namespace) -> dict[str, object]:
     process = settings_process()
     kinds = {alarm_word(alarm, process).replace(" ", "-"): alarm for alarm in alarms_of(process)}
     if options.alarm is not None and options.alarm not in kinds:
-        raise UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
+        raise errors.UsageError(f"unknown alarm '{options.alarm}'; choose from {', '.join(kinds)}")
     alarm = ALL_ALARMS if options.alarm is None else kinds[options.alarm]
     return {"kind": "alarm", "alarm": alarm, "action": int(AlarmAction.ACKNOWLEDGE)}
 
@@ -307,11 +298,11 @@ def _sensor_fault(options: argparse.Namespace) -> dict[str, object]:
 
     names, shows = settings_process().output_names, options.shows
     if options.output not in names:
-        raise UsageError(f"unknown output '{options.output}'; choose from {', '.join(names)}")
+        raise errors.UsageError(f"unknown output '{options.output}'; choose from {', '.join(names)}")
     try:
         shown = {"fault": SENSOR_FAULTS[shows]} if shows in SENSOR_FAULTS else {"fault": 3, "value": float(shows)}
     except ValueError:
-        raise UsageError(f"'{shows}': a sensor shows {', '.join(SENSOR_FAULTS)}, or a value") from None
+        raise errors.UsageError(f"'{shows}': a sensor shows {', '.join(SENSOR_FAULTS)}, or a value") from None
     return {"kind": "sensor_fault", "output": options.output, **shown}
 
 
@@ -325,7 +316,7 @@ def _declare_page(parser: argparse.ArgumentParser) -> None:
 def execute_page(options: argparse.Namespace) -> int:
     """The operator's page of a rig that is up, or of recorded runs."""
     if len(options.runs) > 2:
-        raise UsageError(f"{len(options.runs)} runs: one is replayed, or two side by side")
+        raise errors.UsageError(f"{len(options.runs)} runs: one is replayed, or two side by side")
     from coldloop_rig.live.up import check_page
 
     effective = common.configuration(options).settings
@@ -399,7 +390,7 @@ def _since(text: str) -> tuple[int, float]:
 def execute_events(options: argparse.Namespace) -> int:
     """The journal of a running service: what happened, when, and who did it."""
     if options.csv is not None and options.csv.is_file() and not options.force:
-        raise UsageError(f"{options.csv} exists: name another file with --csv, or overwrite it with --force")
+        raise errors.UsageError(f"{options.csv} exists: name another file with --csv, or overwrite it with --force")
     interrupted = run_until_interrupted(lambda: _show_journal(options))
     return 130 if interrupted and not options.follow else 0  # that is how --follow ends
 
@@ -412,7 +403,7 @@ async def _show_journal(options: argparse.Namespace) -> None:
     settings = common.operator_settings(options)
     process = settings.process
     if options.endpoint is not None and (options.rig or options.port_base):
-        raise UsageError("HOST:PORT, --rig and --port-base: give one of them")
+        raise errors.UsageError("HOST:PORT, --rig and --port-base: give one of them")
     if options.endpoint is not None:
         options.rig = [options.endpoint] * len(common.SERVICES)
     place: Endpoint = getattr(common.rig_endpoints(options, settings), options.service)
@@ -487,7 +478,7 @@ class _CsvFile:
             self._file = None
             if not present:
                 self._path.unlink(missing_ok=True)
-            raise ResultsError(f"{self._path}: {error.strerror}; choose another --csv") from None
+            raise errors.ResultsError(f"{self._path}: {error.strerror}; choose another --csv") from None
         self._events += len(events)
 
     def close(self) -> None:
@@ -523,7 +514,7 @@ def execute_certificates(options: argparse.Namespace) -> int:
 
     if options.revoke or options.renew_list:
         if options.hosts:
-            raise UsageError(
+            raise errors.UsageError(
                 f"--host {options.hosts[0]}: has no effect on a list of revoked certificates; for another host make "
                 "certificates in another folder"
             )

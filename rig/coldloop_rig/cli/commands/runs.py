@@ -1,31 +1,27 @@
-"""Commands about runs (done, recorded, repeated, drawn, compared), and about the plant, its model and its controller."""
+"""Commands about runs (done, recorded, repeated, drawn, compared), and about plant, model and controller."""
 
 import argparse
+import math
 import sys
 from contextlib import nullcontext
+from functools import partial
+from importlib.metadata import entry_points
+from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 from coldloop.errors import NOT_FINITE, UsageError
 from coldloop.process.updating_periods import duration
 from coldloop.service import add_configuration_options
-from coldloop_rig.cli.commands import options as common
-
-if TYPE_CHECKING:
-    from coldloop_rig.cosim.scenario import Job
-    from coldloop_rig.figures.worker import FigureProcess
-import math
-from functools import partial
-from importlib.metadata import entry_points
-from importlib.resources import files
-from typing import TYPE_CHECKING, Final
-
 from coldloop.text import require_regular_file, whole_text
+from coldloop_rig.cli.commands import options as common
 from coldloop_rig.text_tables import aligned, fitted, width
 
 if TYPE_CHECKING:
     from coldloop.process.lti_model import LtiModel
     from coldloop_optimizer_plc.qp.problem import PredictiveProblem
+    from coldloop_rig.cosim.scenario import Job
+    from coldloop_rig.figures.worker import FigureProcess
     from coldloop_rig.settings import Settings
 
 

@@ -26,20 +26,9 @@ from coldloop_control_plc.scan import Scan, decide, observe
 from coldloop_optimizer_plc import scheme
 from coldloop_optimizer_plc.decisions import Latched, note_answer, take_update
 from coldloop_optimizer_plc.scheme import OptimizerState
+from coldloop_rig.cosim.compiled import records
 from coldloop_rig.cosim.compiled.plants import advance_plant
-from coldloop_rig.cosim.compiled.records import (
-    FIRST,
-    LOAD,
-    SOLVED,
-    TICK,
-    Array,
-    Optimizer,
-    PlantState,
-    Records,
-    Reports,
-    Trace,
-    World,
-)
+from coldloop_rig.cosim.compiled.records import Array, Optimizer, PlantState, Records, Reports, Trace, World
 
 Counts = NDArray[np.int64]
 
@@ -90,14 +79,14 @@ def go_on(
     """Do what `play` does. `rows` (2, 240, inputs) are those of a slot."""
     guard, player = parts.guard[0], parts.player[0]
     s = Scan(guard, parts.ladder[0], player, parts.sensors[0], parts.alarms[0], parts.watchdog[0])
-    tick = counts[TICK]
+    tick = counts[records.TICK]
     while tick < until:
         if awaits_sequence(player, tick):
             return AWAITED
-        row = tick - counts[FIRST]
-        while counts[LOAD] + 1 < w.load_ticks.shape[0] and w.load_ticks[counts[LOAD] + 1] <= tick:
-            counts[LOAD] += 1
-        load = w.load_watts[counts[LOAD]]
+        row = tick - counts[records.FIRST]
+        while counts[records.LOAD] + 1 < w.load_ticks.shape[0] and w.load_ticks[counts[records.LOAD] + 1] <= tick:
+            counts[records.LOAD] += 1
+        load = w.load_watts[counts[records.LOAD]]
         trace.load[row], trace.y[row], trace.x[row], trace.station[row] = load, plant.y, plant.x, plant.station
         changed = decide(w.scan, s, tick, rows)  # type: ignore[arg-type]
         u, y, x = guard.applied, trace.y[row], trace.x[row]
@@ -107,7 +96,7 @@ def go_on(
             for i in range(plant.y.shape[0]):
                 plant.y[i] = plant.y[i] + w.biases[i] + w.deviations[i] * plant.noise[row, i]
         told = observe(w.scan, s, tick, y, x, trace.load[row])
-        counts[TICK] = tick + 1
+        counts[records.TICK] = tick + 1
         if told or changed:
             return OBSERVED
         if latches(player, tick, trace.load[row]):
@@ -132,7 +121,7 @@ def run_block(
     """Do ticks and updates before the tick `until`, or until a shortage or the suspects change; return why no more."""
     w, o, parts, rows, plant = borrowed(w), borrowed(o), borrowed(parts), borrowed(rows), borrowed(plant)
     trace, reports, counts = borrowed(trace), borrowed(reports), borrowed(counts)
-    before, first = np.empty(trace.u.shape[1], np.float32), counts[FIRST]
+    before, first = np.empty(trace.u.shape[1], np.float32), counts[records.FIRST]
     for i in range(before.shape[0]):
         before[i] = parts.guard[0].applied[i]
     while True:
@@ -141,7 +130,7 @@ def run_block(
             if not answer(w, o, parts, rows, reports, counts):
                 return outcome
         elif outcome == LATCHED:
-            row = counts[TICK] - 1 - first
+            row = counts[records.TICK] - 1 - first
             if plan(o, parts, trace, row, trace.u[row - 1] if row > 0 else before):
                 return DONE
         else:
@@ -151,7 +140,7 @@ def run_block(
 @kernel
 def answer(w: World, o: Optimizer, parts: Records, rows: Array, reports: Reports, counts: Counts) -> bool:
     """Solve the problem of the update under way; return whether the control PLC accepts the sequence."""
-    m, player, limits, tick = o.memory, parts.player[0], w.scan.limits, counts[TICK]
+    m, player, limits, tick = o.memory, parts.player[0], w.scan.limits, counts[records.TICK]
     scheme.solve(o.constants, o.method, m)
     sent, other = m.sent.numbers[0], 1 - player.slot
     length, first_tick, offered = sent.length, player.next_update_tick, rows[other]
@@ -168,8 +157,8 @@ def answer(w: World, o: Optimizer, parts: Records, rows: Array, reports: Reports
         return False
     accept(player, sent.number, first_tick, length)
     note_answer(m, LATE)
-    report(m, reports.counts[counts[SOLVED]], reports.values[counts[SOLVED]])
-    counts[SOLVED] += 1
+    report(m, reports.counts[counts[records.SOLVED]], reports.values[counts[records.SOLVED]])
+    counts[records.SOLVED] += 1
     trigger(parts.watchdog[0], tick)
     return True
 

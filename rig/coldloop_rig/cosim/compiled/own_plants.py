@@ -5,18 +5,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from coldloop.kernels.compiled import kernel
-from coldloop_plant.own_plants import (
-    LagTable,
-    LinearPlant,
-    Matrices,
-    TransferFunctionPlant,
-    advance_lags,
-    advance_linear,
-)
+from coldloop_plant import own_plants as plants
 from coldloop_rig.cosim.compiled.plants import advances
 from coldloop_rig.cosim.compiled.records import Array
 
-Linear = LinearPlant | TransferFunctionPlant
+Linear = plants.LinearPlant | plants.TransferFunctionPlant
 
 
 class OwnState(NamedTuple):
@@ -34,21 +27,21 @@ class OwnState(NamedTuple):
     """Tick of the trace's first row."""
 
 
-@advances(Matrices)
+@advances(plants.Matrices)
 @kernel
-def advance_undelayed(c: Matrices, plant: OwnState, u: Array, load: float, row: int) -> None:
+def advance_undelayed(c: plants.Matrices, plant: OwnState, u: Array, load: float, row: int) -> None:
     """Go one tick forward with a linear plant."""
-    advance_linear(c, plant.x, u, load, plant.met[row + 1], plant.y)
+    plants.advance_linear(c, plant.x, u, load, plant.met[row + 1], plant.y)
 
 
-@advances(LagTable)
+@advances(plants.LagTable)
 @kernel
-def advance_delayed(c: LagTable, plant: OwnState, u: Array, load: float, row: int) -> None:
+def advance_delayed(c: plants.LagTable, plant: OwnState, u: Array, load: float, row: int) -> None:
     """Go one tick forward with lags, and with disturbances as the last states and outputs."""
     now, then, own = plant.met[row], plant.met[row + 1], plant.y.shape[0] - c.measured.shape[0]
     w = np.empty(1 + now.shape[0])
     w[0], w[1:] = load, now
-    advance_lags(c, plant.memory, plant.first + row, u, w, plant.y[:own])
+    plants.advance_lags(c, plant.memory, plant.first + row, u, w, plant.y[:own])
     plant.x[plant.x.shape[0] - then.shape[0] :] = then
     for i in range(c.measured.shape[0]):
         plant.y[own + i] = then[c.measured[i]]
@@ -65,7 +58,7 @@ class CompiledOwn:
         """Return the present state, and what the next `ticks` ticks bring."""
         p = self._program
         x, y, met = np.array(p.state), np.array(p.measure()), p.disturbances.ahead(p.tick, ticks)
-        memory = p.memory if isinstance(p, TransferFunctionPlant) else ()
+        memory = p.memory if isinstance(p, plants.TransferFunctionPlant) else ()
         return OwnState(x, y, np.empty(0), noise, met, memory, p.tick)
 
     def restore(self, state: OwnState, tick: int, u: Array) -> None:

@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 
 from coldloop_control_plc.output_limits import Limits
 from coldloop_control_plc.scan import Scan, ScanConstants
-from coldloop_optimizer_plc.decisions import Latched, Starts
-from coldloop_optimizer_plc.rules import UpdatingRule
-from coldloop_optimizer_plc.scheme import Constants, OptimizerState
+from coldloop_optimizer_plc import decisions, rules, scheme
 
 Array = NDArray[np.float64]
 
@@ -106,14 +104,14 @@ class World(NamedTuple):
 class Optimizer(NamedTuple):
     """The optimiser's program, as kernels take it."""
 
-    constants: Constants
+    constants: scheme.Constants
     method: Any
     """Solver constants; the type depends on the solver, which is one of our own."""
-    rule: UpdatingRule
-    starts: Starts
-    memory: OptimizerState
+    rule: rules.UpdatingRule
+    starts: decisions.Starts
+    memory: scheme.OptimizerState
     """State of the optimiser, which is overwritten."""
-    latched: Latched
+    latched: decisions.Latched
     """Room for an update."""
 
 

@@ -11,12 +11,10 @@ from coldloop.registers.control_plc import SEQUENCE_ROWS, Update, Verdict
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop.registers.plant import Measurement
 from coldloop_control_plc.program import ControlProgram
-from coldloop_optimizer_plc.decisions import Latched, Starts
+from coldloop_optimizer_plc import decisions, solvers
 from coldloop_optimizer_plc.program import OptimizerProgram
-from coldloop_optimizer_plc.solvers import KernelSolver
 from coldloop_plant.program import PlantProgram
-from coldloop_rig.cosim.compiled import loops, records
-from coldloop_rig.cosim.compiled.plants import CompiledPlant
+from coldloop_rig.cosim.compiled import loops, plants, records
 from coldloop_rig.results.recording import NO_STATION, STATION_COLUMNS, SampleBlock
 
 
@@ -44,7 +42,7 @@ class CompiledStretches:
     def __init__(
         self,
         plant: PlantProgram,
-        compiled: CompiledPlant,
+        compiled: plants.CompiledPlant,
         control_plc: ControlProgram,
         optimizer_plc: OptimizerProgram,
         load: LoadProfile,
@@ -55,7 +53,7 @@ class CompiledStretches:
         process = control_plc.alarm_settings.process
         ours = type(optimizer_plc) is OptimizerProgram  # a subclass may behave differently
         others = optimizer_plc.plans_by_steps or process.forecasts
-        self._updates_too = ours and isinstance(optimizer_plc.solver, KernelSolver) and not others
+        self._updates_too = ours and isinstance(optimizer_plc.solver, solvers.KernelSolver) and not others
         """Whether the updates have a compiled form: solver, rule and estimator of our own, no forecast."""
         self._may_compile = may_compile
         self._is_there: dict[Callable[..., int], bool] = {}
@@ -68,7 +66,7 @@ class CompiledStretches:
         self._pause_until = 0
         real = optimizer_plc.state.u.dtype
         u_before, u, y, x, ahead = (np.zeros(size, real) for size in (sizes[0], *sizes, 0))
-        self._latched = Latched(0, 0, 0, real.type(0.0), u_before, u, y, x, ahead)
+        self._latched = decisions.Latched(0, 0, 0, real.type(0.0), u_before, u, y, x, ahead)
         self._world = records.World(
             compiled.constants, plant.biases, plant.deviations, np.array(load.times), np.array(load.watts),
             records.as_arrays(control_plc.scan_constants),
@@ -94,7 +92,7 @@ class CompiledStretches:
             loop: Callable[..., int] = loops.play
             further: tuple[Any, ...] = (scans, self._rows, plant, self._trace)
             if self._updates_too:
-                starts = Starts(o.rule.first, o.rule.after_interruption())
+                starts = decisions.Starts(o.rule.first, o.rule.after_interruption())
                 parts = records.Optimizer(o.constants, o.method, o.rule, starts, o.state, self._latched)
                 loop, further = loops.run_block, (parts, scans, self._rows, plant, self._trace, self._reports)
             outcome = self._run(loop, self._world, *further, counts, until)

@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 
 from coldloop.errors import ConfigurationError
 from coldloop.kernels.compiled import kernel
-from coldloop.process.lti_model import LtiModel
-from coldloop.process.sections import Bath
+from coldloop.process import lti_model, sections
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.qp.linear_algebra import DOUBLE, Array, Real, multiply, rounded
 from coldloop_optimizer_plc.settings import ControlDesign, Target
@@ -66,7 +65,7 @@ class PredictionModel:
     `constrained` are those that have a band.
     """
 
-    def __init__(self, model: LtiModel) -> None:
+    def __init__(self, model: lti_model.LtiModel) -> None:
         self.model = model
         self.process = model.declared
         self.constrained = self.process.controlled
@@ -153,7 +152,7 @@ class PredictionModel:
         return Transition(self.C, self.D, self.G)
 
 
-def prediction_of(model: LtiModel, disturbed: Sequence[int], design: ControlDesign) -> PredictionModel:
+def prediction_of(model: lti_model.LtiModel, disturbed: Sequence[int], design: ControlDesign) -> PredictionModel:
     """Return the model that an optimiser predicts by: with constants of the signals `disturbed`, and what is forecast.
 
     Changes are forecast as means over the time from one decision instant to the next.
@@ -166,14 +165,14 @@ def prediction_of(model: LtiModel, disturbed: Sequence[int], design: ControlDesi
     return prediction.with_disturbances(disturbed).with_forecasts(sources, design.decision_instants)
 
 
-def state_cost(model: LtiModel, design: ControlDesign) -> Array:
+def state_cost(model: lti_model.LtiModel, design: ControlDesign) -> Array:
     """Return Q, shape (n, n): what the states, and the outputs through them, weigh."""
     weights = np.array([output.weight for output in model.declared.outputs])
     through_outputs: Array = model.C.T @ (weights[:, None] * model.C)
     return through_outputs + np.diag(state_weights(model, design))
 
 
-def state_weights(model: LtiModel, design: ControlDesign) -> Array:
+def state_weights(model: lti_model.LtiModel, design: ControlDesign) -> Array:
     """Return what states weigh themselves, shape (n,): those of a bath with a cold end.
 
     Pressure, level and the mean of the temperatures weigh alike; further states and those of other processes nothing.
@@ -273,7 +272,7 @@ class TargetSearch(NamedTuple):
     feed: int
 
 
-def rest_of(prediction: PredictionModel, design: ControlDesign, bath: Bath) -> Rest:
+def rest_of(prediction: PredictionModel, design: ControlDesign, bath: sections.Bath) -> Rest:
     """Return where the model of a plant with a bath rests."""
     outlet, n_inputs = prediction.process.output_names.index(bath.turbine_outlet), design.n_inputs
     n, scale = len(prediction.model.x0), np.array(design.input_scale)

@@ -13,18 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process.cold_box import (
-    COLD_BOX,
-    COLDEST_CELLS_K,
-    OUTPUT_NAMES,
-    SATURATION_BAR,
-    STATE_NAMES,
-    STATE_UNITS,
-    T5,
-    WARMEST_CELL_K,
-    ModelRange,
-    model_range,
-)
+from coldloop.process import cold_box
 from coldloop.process.lti_model import LtiModel
 from coldloop_plant import equilibrium
 from coldloop_plant.cold_box import ColdBox, advance, evaluated, streams
@@ -44,7 +33,7 @@ RELAXATION_S, RELAXATION_STEP_S = 3000.0, 0.5
 LEVEL_GAIN: Final = 100.0  # W of load per % of level, while relaxing, for the CV155 of the reference plant
 
 
-def state_scales(box: ColdBox, units: Iterable[str] = STATE_UNITS) -> RealArray:
+def state_scales(box: ColdBox, units: Iterable[str] = cold_box.STATE_UNITS) -> RealArray:
     """Return the size of an ordinary deviation of each state, by default of the cold box: 2 kPa, 1 % of level, 1 K."""
     return np.array([box.separator.volume / 100.0 if unit == "m3" else SIZES[unit] for unit in units])
 
@@ -74,7 +63,7 @@ def linearisation_error(x: RealArray, u: RealArray, w: float, box: ColdBox, heli
     and load by `FURTHER_SIZES`, outputs by 1 (%, Hz, K, bar), rates per second.
     """
     evaluate, at, rates = _equations(x.size, box, helium), np.array([*x, *u, w]), state_scales(box)
-    sizes, rows = np.array([*rates, *FURTHER_SIZES]), np.array([*rates, *np.ones(len(OUTPUT_NAMES))])
+    sizes, rows = np.array([*rates, *FURTHER_SIZES]), np.array([*rates, *np.ones(len(cold_box.OUTPUT_NAMES))])
     fine, coarse = equilibrium.central_differences(evaluate, at, 1e-3 * sizes)
     difference = equilibrium.complex_step(evaluate, at, sizes) - (4.0 * fine - coarse) / 3.0
     return float(np.max(np.abs(difference * sizes / rows[:, np.newaxis])))
@@ -203,30 +192,33 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
         return
     s = streams(x, u, box, helium)
     P_mix, P_nozzle, relief = s.P_mix / PA_PER_BAR, s.P_turbine / PA_PER_BAR, box.separator.relief_pressure
-    outside = model_range(x, box.P_HP / PA_PER_BAR, box.P_LP / PA_PER_BAR)
-    if outside & ModelRange.BATH_PRESSURE or x[0] > relief:
+    outside = cold_box.model_range(x, box.P_HP / PA_PER_BAR, box.P_LP / PA_PER_BAR)
+    if outside & cold_box.ModelRange.BATH_PRESSURE or x[0] > relief:
         half = "warm" if s.P_mix - box.P_LP > x[0] - s.P_mix else "cold"
         yield (
-            f"bath: its pressure would be {x[0] / PA_PER_BAR:.2f} bar, not between {SATURATION_BAR[0]:g} bar and"
-            f" bath.relief_pressure_bar, {relief / PA_PER_BAR:g} bar; less return_line.{half}_drop_bar or"
+            f"bath: its pressure would be {x[0] / PA_PER_BAR:.2f} bar, not between {cold_box.SATURATION_BAR[0]:g} bar"
+            f" and bath.relief_pressure_bar, {relief / PA_PER_BAR:g} bar; less return_line.{half}_drop_bar or"
             " boundaries.p_lp_bar would help, or less flow (cv155.area_mm2, turbine.nozzle_g_sqrt_k_per_s_bar)"
         )
-    if outside & (ModelRange.COLD_CELL | ModelRange.WARM_CELL):
-        cell = int(np.argmin(x[2:] - COLDEST_CELLS_K) if outside & ModelRange.COLD_CELL else np.argmax(x[2:]))
-        name, coldest = STATE_NAMES[2 + cell], COLDEST_CELLS_K[cell]
+    if outside & (cold_box.ModelRange.COLD_CELL | cold_box.ModelRange.WARM_CELL):
+        cell = int(
+            np.argmin(x[2:] - cold_box.COLDEST_CELLS_K) if outside & cold_box.ModelRange.COLD_CELL else np.argmax(x[2:])
+        )
+        name, coldest = cold_box.STATE_NAMES[2 + cell], cold_box.COLDEST_CELLS_K[cell]
         yield (
             f"{part_of(name)}: {name} would be {x[2 + cell]:.1f} K, and is to be within {coldest:g} to"
-            f" {WARMEST_CELL_K:g} K; change {part_of(name)}.ua_w_per_k or the flows through it"
+            f" {cold_box.WARMEST_CELL_K:g} K; change {part_of(name)}.ua_w_per_k or the flows through it"
         )
     if s.P_mix > CRITICAL_RATIO * s.P_turbine:
         yield (
             f"turbine: its nozzle is not choked with {P_nozzle:.2f} bar before and {P_mix:.2f} bar behind it; less"
             " turbine.nozzle_g_sqrt_k_per_s_bar or a wider CV156 would help, or less return_line.warm_drop_bar"
         )
-    if y[T5] <= saturation(s.P_mix, helium).T + 1e-6:
+    if y[cold_box.T5] <= saturation(s.P_mix, helium).T + 1e-6:
         yield (
-            f"turbine: its exhaust would be wet, T5 at the boiling point of {y[T5]:.2f} K; less turbine.efficiency or"
-            " less nef34.ua_w_per_k would help, or more load (a smaller turbine.nozzle_g_sqrt_k_per_s_bar)"
+            f"turbine: its exhaust would be wet, T5 at the boiling point of {y[cold_box.T5]:.2f} K; less"
+            " turbine.efficiency or less nef34.ua_w_per_k would help, or more load (a smaller"
+            " turbine.nozzle_g_sqrt_k_per_s_bar)"
         )
     if w <= 0.0:
         levers = (
@@ -238,8 +230,9 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
         )
     if not isfinite(residual):
         k = int(np.argmax(np.abs(evaluated(x, u, w, box, helium)[0] / state_scales(box))))
+        name, unit = cold_box.STATE_NAMES[k], cold_box.STATE_UNITS[k]
         yield (
-            f"{part_of(STATE_NAMES[k])}: finds no rest, {STATE_NAMES[k]} ({STATE_UNITS[k]}) moves most; another"
+            f"{part_of(name)}: finds no rest, {name} ({unit}) moves most; another"
             " operating_point.cv155_pct would help, or less nef1.ua_w_per_k and nef2.ua_w_per_k for their flows"
         )
         return
@@ -249,14 +242,14 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
 
 
 def _modes(x: RealArray, u: RealArray, w: float, box: ColdBox, helium: Helium) -> Modes:
-    return Modes.of(linearise(x, u, w, box, helium).A, state_scales(box), list(map(part_of, STATE_NAMES)))
+    return Modes.of(linearise(x, u, w, box, helium).A, state_scales(box), list(map(part_of, cold_box.STATE_NAMES)))
 
 
 def part_of(state: str) -> str:
     """Return the section of a plant file that a state belongs to."""
     if state.startswith("T_"):
         return state.split("_")[1]
-    return "bath" if state in STATE_NAMES else "station"
+    return "bath" if state in cold_box.STATE_NAMES else "station"
 
 
 def slower(part: str) -> str:
@@ -306,7 +299,7 @@ def held_loads(
             except NoEquilibriumError:
                 rest = None
                 continue
-            if warmth[0] <= rest.y[T5] <= warmth[1]:
+            if warmth[0] <= rest.y[cold_box.T5] <= warmth[1]:
                 rests.append(rest)
     least, largest = min(rests, key=lambda rest: rest.w), max(rests, key=lambda rest: rest.w)
     by = heater[1] - heater[0]
@@ -326,8 +319,8 @@ def build_model(box: ColdBox = REFERENCE) -> LtiModel:
 def model_at(rest: Equilibrium, box: ColdBox, helium: Helium, parameters: Mapping[str, Any] | None = None) -> LtiModel:
     """Return the linear model of `box` at a state of rest; `parameters` are what its file says of the plant."""
     return equilibrium.model_of(
-        linearise(rest.x, rest.u, rest.w, box, helium), rest.x, rest.u, rest.w, rest.y, COLD_BOX,
-        dict(zip(STATE_NAMES, STATE_UNITS, strict=True)), parameters_digest(box, helium),
+        linearise(rest.x, rest.u, rest.w, box, helium), rest.x, rest.u, rest.w, rest.y, cold_box.COLD_BOX,
+        dict(zip(cold_box.STATE_NAMES, cold_box.STATE_UNITS, strict=True)), parameters_digest(box, helium),
         plant_parameters=dict(parameters or {}),
     )  # fmt: skip
 

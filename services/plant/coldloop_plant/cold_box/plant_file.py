@@ -10,13 +10,9 @@ from typing import Annotated, Any, ClassVar, Final
 from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
 
-from coldloop.process import sections
-from coldloop.process.cold_box import SATURATION_BAR, SUPPLY_BAR
-from coldloop.process.lti_model import COLD_BOX
+from coldloop.process import cold_box, lti_model, sections
 from coldloop_plant.cold_box import CELLS, ColdBox
-from coldloop_plant.components.expansion import ReturnLine, Turbine, Valve
-from coldloop_plant.components.heat_exchanger import HeatExchanger
-from coldloop_plant.components.phase_separator import PhaseSeparator
+from coldloop_plant.components import expansion, heat_exchanger, phase_separator
 
 IN_SI: Final = {
     "_g_sqrt_k_per_s_bar": (1.0, 1e8),  # kg sqrt(K)/(s Pa)
@@ -66,7 +62,7 @@ class BathSection(Section):
 
     volume_m3: Annotated[float, within(0.005, 10)] = 0.2
     wall_kg: Annotated[float, within(0.1, 10_000)] = 50.0
-    relief_pressure_bar: Annotated[float, within(*SATURATION_BAR)] = 1.8
+    relief_pressure_bar: Annotated[float, within(*cold_box.SATURATION_BAR)] = 1.8
     relief_span_bar: Annotated[float, within(0.01, 2)] = 0.3
     relief_area_mm2: Annotated[float, within(1, 100_000)] = 400.0
 
@@ -96,10 +92,10 @@ class ExchangerSection(Section):
     volume_l: Litres
     aluminium_kg: Mass
 
-    def component(self, cells: int) -> HeatExchanger:
+    def component(self, cells: int) -> heat_exchanger.HeatExchanger:
         """Return the exchanger in SI units."""
         conductance, volume, aluminium = self.si
-        return HeatExchanger(conductance, volume, aluminium, cells)
+        return heat_exchanger.HeatExchanger(conductance, volume, aluminium, cells)
 
 
 class ReturnLineSection(Section):
@@ -118,8 +114,8 @@ class ReturnLineSection(Section):
 class BoundariesSection(Section):
     """Boundary conditions of the cold box: the last fields of `ColdBox`."""
 
-    p_hp_bar: Annotated[float, within(*SUPPLY_BAR)] = 16.0
-    p_lp_bar: Annotated[float, within(SATURATION_BAR[0], 2)] = 1.05
+    p_hp_bar: Annotated[float, within(*cold_box.SUPPLY_BAR)] = 16.0
+    p_lp_bar: Annotated[float, within(cold_box.SATURATION_BAR[0], 2)] = 1.05
     t_in_k: Annotated[float, within(30, 300)] = 80.0
 
 
@@ -167,13 +163,13 @@ class BoxParameters(Section):
         cold_drop, cold_flow, warm_drop, warm_flow = self.return_line.si
         supply, suction, T_in = self.boundaries.si
         return ColdBox(
-            separator=PhaseSeparator(*self.bath.si),
-            jt_valve=Valve(*self.cv155.si),
-            turbine=Turbine(Valve(cv156), *turbine),
+            separator=phase_separator.PhaseSeparator(*self.bath.si),
+            jt_valve=expansion.Valve(*self.cv155.si),
+            turbine=expansion.Turbine(expansion.Valve(cv156), *turbine),
             nef1=self.nef1.component(CELLS[0]),
             nef2=self.nef2.component(CELLS[1]),
             nef34=self.nef34.component(CELLS[2]),
-            return_line=ReturnLine(cold_drop / cold_flow**2, warm_drop / warm_flow**2),
+            return_line=expansion.ReturnLine(cold_drop / cold_flow**2, warm_drop / warm_flow**2),
             P_HP=supply,
             P_LP=suction,
             T_in=T_in,
@@ -186,7 +182,7 @@ REFERENCE: Final = BoxParameters().box
 class PlantFile(BoxParameters):
     """A cold box and its operating point."""
 
-    kind: ClassVar[str] = COLD_BOX
+    kind: ClassVar[str] = lti_model.COLD_BOX
     """Name of the kind of plant that it describes."""
     operating_point: OperatingPointSection = OperatingPointSection()
 
