@@ -1,5 +1,6 @@
 """`coldloop certificates`: what it makes fits together, and it overwrites nothing."""
 
+import ssl
 import stat
 import tomllib
 from pathlib import Path
@@ -11,7 +12,7 @@ from cryptography.hazmat.primitives.serialization import Encoding
 
 from coldloop.config import load_configuration
 from coldloop.modbus.connection import Caller, caller_with
-from coldloop.modbus.tls import client_context, server_context
+from coldloop.modbus.tls import tls_context
 from coldloop_rig.settings import Settings
 
 if TYPE_CHECKING:
@@ -54,10 +55,10 @@ def test_the_configuration_that_comes_with_them_is_whole_and_its_files_can_be_us
     settings = load_configuration(Settings, file=out / "tls.toml", environment={}).settings
     for section in (settings.plant, settings.control_plc, settings.optimizer_plc):
         assert section.server.tls is not None
-        server_context(section.server.tls, "server")
+        tls_context(section.server.tls, "server", ssl.PROTOCOL_TLS_SERVER)
     for tls in (settings.control_plc.plant.tls, settings.optimizer_plc.control_plc.tls, settings.rig.tls):
         assert tls is not None
-        client_context(tls, "client")
+        tls_context(tls, "client")
     assert tomllib.loads((out / "tls.toml").read_text())["rig"]["tls"]["key"] == str(out / "operator.key")
 
 
@@ -78,7 +79,7 @@ def test_what_is_revoked_is_in_the_list_that_the_configuration_names_and_stays_i
     settings = load_configuration(Settings, file=out / "tls.toml", environment={}).settings
     assert settings.plant.server.tls is not None
     assert settings.plant.server.tls.crl == out / "ca.crl"
-    server_context(settings.plant.server.tls, "server")
+    tls_context(settings.plant.server.tls, "server", ssl.PROTOCOL_TLS_SERVER)
     assert not (out / "ca.crl.new").exists()
 
 
