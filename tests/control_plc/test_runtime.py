@@ -240,6 +240,26 @@ async def test_what_an_operator_says_before_the_rack_is_found_holds(tmp_path: Pa
             assert alarm(plc, AlarmKind.CLOCK_SKEW) is AlarmState.SHELVED
 
 
+async def test_a_requested_session_is_on_the_disk_before_the_answer(tmp_path: Path) -> None:
+    file = tmp_path / "state"
+    async with running(SmallRack(4), control_plc={"retain": {"file": file}}) as plc:
+        ask(plc, ControlSession(3, 0, 1.0))
+        await until(lambda: plc.sessions.running)
+        ask(plc, Operator(OperatorMode.MANUAL, (43.0, 75.0, 36.0)))
+        ask(plc, ControlSession(4, 1, 2.0))
+        content = RetainedFile(file, OWNER, HEADER.short_digest).load()  # as a start finds it after a kill
+        assert plc.bank.get(Identity).session == 3, "it has not begun"
+    assert content is not None
+    assert (content["session"], content["tick"], content["updates"], content["playing"]) == (4, 0, 0, None)
+    assert content["pace"][:2] == [True, 2.0]
+    assert content["operator"][0] == OperatorMode.AUTO, "what an operator had said of the session before is over"
+    killed = tmp_path / "killed"
+    RetainedFile(killed, OWNER, HEADER.short_digest).save(content)
+    async with running(SmallRack(4), control_plc={"retain": {"file": killed}}) as plc:
+        await until(lambda: plc.sessions.running)
+        assert plc.bank.get(Identity).session == 4
+
+
 async def test_a_session_is_gone_on_with_after_several_starts_without_the_rack(tmp_path: Path) -> None:
     settings = {"retain": {"file": tmp_path / "state"}}
     async with running(SmallRack(4), control_plc=settings) as plc:

@@ -73,8 +73,13 @@ class ControlProgram:
 
     def reset_operating_mode(self) -> None:
         """Let those drive whom the configuration names: no operator has said anything."""
+        self.operator = self.configured_operator
+
+    @property
+    def configured_operator(self) -> Operator:
+        """What an operator would have said for the configured controller to drive."""
         classical = self._section.driver is ControlStrategy.CLASSICAL
-        self.operator = Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, self._initial)
+        return Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, self._initial)
 
     def recall(self, operator: Operator, alarms: Sequence[Alarm], watchdog: int, tick: int) -> None:
         """Take over what operators had said before a restart, and the alarms; the session is resumed later.

@@ -238,8 +238,11 @@ class ControlPlc:
         self._keep()
 
     def _keep(self) -> None:
-        """Save the present state; for a session still to be resumed, the state before the restart."""
-        self._store.keep(self._program, self.sessions.pace, self.sessions.kept)
+        """Save the present state; of a session still to be resumed, or to begin, what is known of it."""
+        if self.clients.asked is not None:
+            self._store.keep_requested(self._program, self.clients.asked)
+        else:
+            self._store.keep(self._program, self.sessions.pace, self.sessions.kept)
 
     def _watch_ourselves(self) -> None:
         """Raise the alarms about clock and memory, and note log lines that were lost."""

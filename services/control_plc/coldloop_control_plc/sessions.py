@@ -26,6 +26,8 @@ log = logging.getLogger("coldloop.control_plc")
 
 OWNER: Final = "control_plc/6"
 """Who retained states belong to, and the version of what they hold."""
+ON_THE_DISK_S: Final = 0.25
+"""How long the answer to the request of a session waits for the disk."""
 OF_THE_SESSION: Final = ("session", "tick", "pace", "updates", "playing", "cool_down")
 """Keys of the retained state that belong to a session."""
 
@@ -136,12 +138,23 @@ class ControlStateStore:
 
     def keep(self, program: ControlProgram, pace: TimeBase, pending: RetainedControlState | None = None) -> None:
         """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
+        of_the_session = {} if pending is None else {name: getattr(pending, name) for name in OF_THE_SESSION}
+        if self._writer is not None:
+            self._writer.keep(self.content(program, pace) | of_the_session)
+
+    def keep_requested(self, program: ControlProgram, asked: control_plc.ControlSession) -> None:
+        """Keep the beginning of a session that is requested and has not begun, and wait until it is on the disk.
+
+        A control PLC that is killed at once looks for the rack in it, as the operator's request was answered.
+        """
         if self._writer is None:
             return
-        content = self.content(program, pace)
-        if pending is not None:
-            content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
-        self._writer.keep(content)
+        pace = TimeBase(bool(asked.realtime), asked.factor)
+        self._writer.keep(self.content(program, pace) | {
+            "session": asked.session, "tick": 0, "updates": 0, "playing": None,
+            "cool_down": control_plc.CoolDownStep.FINISHED, "operator": program.configured_operator,
+        })  # fmt: skip
+        self._writer.flush(ON_THE_DISK_S)
 
     def content(self, program: ControlProgram, pace: TimeBase) -> dict[str, Any]:
         """Return the state of a program, as a file holds it; nothing in it changes later."""
