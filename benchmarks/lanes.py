@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from coldloop.kernels.compiled import kernel
 from coldloop.process.cold_box import TICK_S
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop_plant.cold_box import ColdBox, advance
 from coldloop_plant.cold_box.plant_file import REFERENCE

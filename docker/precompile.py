@@ -51,7 +51,7 @@ def default_plant() -> None:
 
 def _make_plant(kind: "PlantKind", brought: "type[RefrigeratorKind] | None" = None) -> None:
     from coldloop.process.load_profile import LoadProfile  # noqa: PLC0415
-    from coldloop.process.lti_model import read_header  # noqa: PLC0415
+    from coldloop.process.model_file import read_header  # noqa: PLC0415
     from coldloop.process.settings import DEFAULT_MODEL_FILE  # noqa: PLC0415
     from coldloop_plant.kinds import plant_maker  # noqa: PLC0415
     from coldloop_plant.settings import PlantSection  # noqa: PLC0415

@@ -53,10 +53,11 @@ def test_a_package_imports_only_what_lies_below_it(package: str) -> None:
     assert not trespasses
 
 
-def test_the_control_plc_runs_without_numpy_numba_and_scipy(processes: Processes) -> None:
+@pytest.mark.parametrize("service", ["control_plc", "hmi"])
+def test_control_plc_and_page_run_without_numpy_numba_and_scipy(service: str, processes: Processes) -> None:
     modules = [
-        ".".join(source.relative_to(ROOT / "services" / "control_plc").with_suffix("").parts).removesuffix(".__init__")
-        for source in (ROOT / "services" / "control_plc").rglob("*.py")
+        ".".join(source.relative_to(ROOT / "services" / service).with_suffix("").parts).removesuffix(".__init__")
+        for source in (ROOT / "services" / service).rglob("*.py")
     ]
     program = (
         "import importlib, sys\n"
@@ -64,7 +65,7 @@ def test_the_control_plc_runs_without_numpy_numba_and_scipy(processes: Processes
         "print(*sorted({name.partition('.')[0] for name in sys.modules}))"
     )
     loaded = set(processes.run_python(program)[0].split())
-    assert "coldloop_control_plc" in loaded
+    assert f"coldloop_{service}" in loaded
     assert not loaded & {
         "numpy",
         "numba",

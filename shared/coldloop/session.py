@@ -5,7 +5,6 @@ plant over F, and all services follow the monotonic clock. Time is never stretch
 """
 
 import time
-from asyncio import sleep
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
@@ -105,6 +104,8 @@ class Pacer:
         The event loop gets its turn also when the tick has been due for long: other tasks are never kept waiting by
         a clock that cannot follow its schedule.
         """
+        from asyncio import sleep  # noqa: PLC0415 a run in one process does without asyncio
+
         await sleep(max(0.0, self.schedule.due(tick) - self._now()))
         lateness = max(0.0, self._now() - self.schedule.due(tick))
         self.record.add(lateness)

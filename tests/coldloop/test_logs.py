@@ -202,3 +202,17 @@ def test_a_program_whose_reader_has_gone_goes_on_and_ends(processes: Processes) 
     assert program.stderr is not None
     program.stderr.close()
     assert program.wait(END_S) == 0
+
+
+def test_a_finaliser_may_log_while_a_line_is_put(stream: io.StringIO) -> None:
+    set_up_logs("plant", "info", stream)
+    (handler,) = (one for one in logging.getLogger().handlers if isinstance(one, QueueingHandler))
+
+    def interrupted() -> None:
+        with handler._changed:  # noqa: SLF001 as if garbage were collected in the midst of it
+            assert handler.put("{}")
+
+    thread = threading.Thread(target=interrupted, daemon=True)
+    thread.start()
+    thread.join(END_S)
+    assert not thread.is_alive(), "the log waits for itself"

@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import pytest
 
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.common import AlarmKind, AlarmState
 from coldloop.registers.control_plc import Acknowledgement, Plan, SequenceHeader, Update, Verdict

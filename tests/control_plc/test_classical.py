@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from coldloop.process.cold_box import COLD_BOX, L1, T5, TICK_S
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.control_plc import Mode
 from coldloop.registers.plant import Measurement

@@ -16,7 +16,7 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from coldloop.errors import DamagedAnswerError, LinkError, PeerUnreachableError, RequestRefusedError
 from coldloop.process.cold_box import COLD_BOX, TICK_S
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.bank import BusyError, Caller
 from coldloop.registers.common import LeaseState

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.errors import ImplausibleAnswerError
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import ANYBODY, RefusedAccessError
 from coldloop.registers.codec import DomainError, codec_of

@@ -12,7 +12,7 @@ import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
 from coldloop.process.cold_box import L1, T1, T5
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import ANYBODY, Caller, RegisterBank
 from coldloop.registers.common import (

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import Bundle, RuleBasedStateMachine, initialize, invariant, precondition, rule
 
 from coldloop.process.cold_box import COLD_BOX, L1, T5
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits, RateReference
 from coldloop.registers.common import ALL_ALARMS, AlarmAction, AlarmCommand, AlarmKind, AlarmState, EventKind
 from coldloop.registers.control_plc import (

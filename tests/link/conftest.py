@@ -12,7 +12,7 @@ import pytest
 
 from coldloop.errors import LinkError
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.codec import WordOrder, codec_of
 from coldloop.registers.common import (

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.server import DeviceIdentity, ModbusServer, ServerSettings
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.bank import Caller, RegisterBank
 from coldloop.registers.common import AlarmKind, Identity

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import pytest
 
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.common import AlarmKind, EventKind, WatchdogTime
 from coldloop.registers.control_plc import Cause, CoolDownStep, LadderStatus, LinkCause, Mode, PlantLinkState

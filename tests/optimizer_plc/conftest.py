@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 import coldloop_optimizer_plc.program
 from coldloop.process.cold_box import COLD_BOX
-from coldloop.process.lti_model import LtiModel, load, read_header
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, InputLimits
 from coldloop.registers.control_plc import Verdict
 from coldloop.registers.plant import Measurement

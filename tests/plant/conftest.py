@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from coldloop.modbus.requests import DeviceIdentity, RequestHandler, Written
-from coldloop.process.lti_model import LtiModel, load, read_header
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.bank import ALL_ROLES, Caller, RefusedAccessError
 from coldloop.registers.codec import Seal, codec_of

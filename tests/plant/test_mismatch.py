@@ -6,7 +6,7 @@ import pytest
 from coldloop.errors import ConfigurationError
 from coldloop.process.cold_box import OUTPUT_NAMES
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop_plant.kinds import plant_maker
 from coldloop_plant.program import MeasurementNoise, PlantProgram

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from coldloop.errors import ModelFileError
-from coldloop.process.lti_model import LtiModel, digest_of, load, read_header
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import digest_of, read_header
 from tests.harness.processes import Processes
 
 
@@ -30,7 +31,7 @@ def test_the_header_is_read_without_numpy(model: LtiModel, model_path: Path, pro
     assert header.x0 == tuple(model.x0)
     program = f"""
 import sys; from pathlib import Path
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 read_header(Path({str(model_path)!r})); print("numpy" in sys.modules)"""
     assert processes.run_python(program)[0].strip() == "False"
 

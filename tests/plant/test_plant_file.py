@@ -12,7 +12,8 @@ import pytest
 from coldloop.config import flattened
 from coldloop.errors import ConfigurationError, LoadFileError, ModelFileError
 from coldloop.process.cold_box import COLD_BOX, T5
-from coldloop.process.lti_model import load, read_document, read_header, write_document
+from coldloop.process.lti_model import load
+from coldloop.process.model_file import read_document, read_header, write_document
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS, InputLimits
 from coldloop_plant.cold_box.model import build_model, model_at, operating_point, parameters_digest
 from coldloop_plant.cold_box.plant_file import REFERENCE, BoxParameters, PlantFile

@@ -8,7 +8,7 @@ import pytest
 
 from coldloop.config import load_configuration
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.registers.common import EventKind
 from coldloop_rig.cosim import one_process
 from coldloop_rig.cosim.compiled import stretches

@@ -14,7 +14,7 @@ from scipy import signal
 from coldloop.errors import ColdloopError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.declaration import Process
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.sections import Lag
 from coldloop_rig.process_file.judgement import described
 from coldloop_rig.process_file.linear_model import lag_model, realised

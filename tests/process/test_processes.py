@@ -7,7 +7,7 @@ from typing import Final
 
 import pytest
 
-from coldloop.process.lti_model import read_document, write_document
+from coldloop.process.model_file import read_document, write_document
 from coldloop.registers.control_plc import Mode
 from coldloop_rig.process_file.making import made_from
 from tests.harness.process_files import COLUMN, TANK, made

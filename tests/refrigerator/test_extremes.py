@@ -5,17 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from coldloop.process.cold_box import (
-    OUTPUT_NAMES,
-    SATURATION_BAR,
-    STATION_SIGNAL_NAMES,
-    TICK_S,
-    WARMEST_BATH_M3,
-    WARMEST_CELL_K,
-    ModelRange,
-    model_range,
-)
+from coldloop.process.cold_box import OUTPUT_NAMES, STATION_SIGNAL_NAMES, TICK_S, ModelRange
 from coldloop.process.load_profile import LoadProfile
+from coldloop.process.model_range import SATURATION_BAR, WARMEST_BATH_M3, WARMEST_CELL_K, model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.plant import StationAlarm, StationMode
 from coldloop_plant.cold_box import ColdBox, streams

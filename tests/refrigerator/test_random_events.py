@@ -9,7 +9,8 @@ from hypothesis import strategies as st
 
 from coldloop.kernels.compiled import kernel
 from coldloop.kernels.intrinsics import borrowed, named, plain_tuples
-from coldloop.process.cold_box import OUTPUT_NAMES, model_range
+from coldloop.process.cold_box import OUTPUT_NAMES
+from coldloop.process.model_range import model_range
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop_plant.cold_box import OUTPUTS, ColdBox, advance, evaluated
 from coldloop_plant.cold_box.plant_file import REFERENCE

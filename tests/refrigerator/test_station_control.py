@@ -8,7 +8,7 @@ import pytest
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE, SHIPPED_MODELS
 from coldloop.registers.plant import StationAlarm, StationMode, Surroundings
 from coldloop_plant.kinds import plant_maker

@@ -5,7 +5,7 @@ import math
 import pytest
 
 from coldloop.process.declaration import LAST_NUMBER, LAST_TICK
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.codec import DomainError, check_record, codec_of
 from coldloop.registers.common import Alarm

@@ -16,7 +16,7 @@ import coldloop_plant.runtime
 from coldloop.modbus.client import RegisterClient
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import Mode, Status
 from coldloop_control_plc.settings import ControlSettings

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pytest
 
 import coldloop_rig.cosim.networked_run
-from coldloop.process.lti_model import read_document, write_document
+from coldloop.process.model_file import read_document, write_document
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop_rig.__main__ import _open_closed_streams
 from tests.harness.processes import Processes

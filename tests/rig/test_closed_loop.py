@@ -9,7 +9,7 @@ import pytest
 
 from coldloop.process.cold_box import L1, T5, TICKS_PER_SAMPLE
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import InputLimits, RateReference
 from coldloop.registers.common import EventKind
 from coldloop.registers.control_plc import Cause, Verdict

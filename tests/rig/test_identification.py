@@ -14,7 +14,8 @@ import pytest
 from numpy.typing import NDArray
 
 from coldloop.process.cold_box import INPUT_NAMES, L1, OUTPUT_NAMES, TICK_S, TICKS_PER_SAMPLE
-from coldloop.process.lti_model import LtiModel, load, read_header
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import read_header
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop_plant.cold_box.model import build_model
 from coldloop_plant.cold_box.plant_file import REFERENCE

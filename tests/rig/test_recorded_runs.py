@@ -22,7 +22,7 @@ from scipy.io import loadmat
 from coldloop.errors import UsageError
 from coldloop.process.cold_box import COLD_BOX
 from coldloop.process.load_profile import read_load_file
-from coldloop.process.lti_model import digest_of
+from coldloop.process.model_file import digest_of
 from coldloop.text import file_digest
 from coldloop_rig import cli
 from coldloop_rig.results.run_folder import RunFolder, claim_folder

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import pytest
 
 from coldloop.modbus.client import RegisterClient
-from coldloop.process.lti_model import read_document, write_document
+from coldloop.process.model_file import read_document, write_document
 from coldloop.process.settings import DEFAULT_MODEL_FILE
 from coldloop.registers.common import Alarm, AlarmKind
 from coldloop.registers.control_plc import PlantLinkState, PlantLinkStatus

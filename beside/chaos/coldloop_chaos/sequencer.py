@@ -343,7 +343,7 @@ class FaultSequencer:
         """Record the state at the end, however the run ended."""
         self.trace.seconds = self._seconds
         logs = {service: self.services.log(service).read_bytes() for service in wiring.SERVICES}
-        self.trace.log_lines = {service: len(log.splitlines()) for service, log in logs.items()}
+        self.trace.log_lines = {service: log.count(b"\n") for service, log in logs.items()}
         self.trace.lost_contacts = self.client.lost_contacts
 
     @property

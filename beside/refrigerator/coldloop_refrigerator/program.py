@@ -21,7 +21,7 @@ from pydantic import BaseModel, ValidationError
 from coldloop import config, errors
 from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.intrinsics import plain_tuples
-from coldloop.process import cold_box, lti_model
+from coldloop.process import cold_box, lti_model, model_file, model_range
 from coldloop.registers.plant import StationAlarm, StationMode, StationSample, StationStatus, Surroundings
 from coldloop_plant import kinds, numeric, program, settings
 from coldloop_plant.cold_box import ColdBox, ColdBoxProgram
@@ -64,7 +64,7 @@ class RefrigeratorFile(BaseModel, frozen=True):
 
     def save(self, path: Path) -> None:
         """Write the file (OSError if it cannot be written)."""
-        lti_model.write_document(path, {"format": lti_model.FORMAT, "plant": KIND, **self.model_dump(mode="json")})
+        model_file.write_document(path, {"format": model_file.FORMAT, "plant": KIND, **self.model_dump(mode="json")})
 
 
 def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERATOR) -> RefrigeratorFile:
@@ -73,7 +73,7 @@ def read_refrigerator_file(path: Path, plant: Refrigerator = REFERENCE_REFRIGERA
     Raises:
         ModelFileError: The file cannot be read, is damaged, or was made from another plant.
     """
-    document = lti_model.read_document(path, REMEDY)
+    document = model_file.read_document(path, REMEDY)
     if document.get("plant") != KIND:
         raise errors.ModelFileError(f"{path}: not the file of a refrigerator; {REMEDY}")
     return rest_in(document, plant, str(path))
@@ -233,7 +233,7 @@ class RefrigeratorProgram(ColdBoxProgram):
     def model_range(self) -> int:
         """Parts outside the property tables at the current tick, bits of `ModelRange`."""
         signals = self._memory.signals
-        return cold_box.present_model_range(self._x, float(signals[tick.HP]), float(signals[tick.LP]))
+        return model_range.present_model_range(self._x, float(signals[tick.HP]), float(signals[tick.LP]))
 
     @property
     def station_status(self) -> StationStatus:
@@ -318,13 +318,13 @@ class RefrigeratorProgram(ColdBoxProgram):
 class RefrigeratorKind:
     """The refrigerator as a `coldloop_plant.kinds.Kind`."""
 
-    def plant_in(self, model: lti_model.ModelHeader | lti_model.LtiModel, where: str) -> tuple[ColdBox, str]:
+    def plant_in(self, model: model_file.ModelHeader | lti_model.LtiModel, where: str) -> tuple[ColdBox, str]:
         """Return the cold box of the refrigerator that a model file describes, and the digest of its parameters."""
         plant = _refrigerator_in(model, where)
         return plant.box, refrigerator_digest(plant)
 
     def maker_of(
-        self, header: lti_model.ModelHeader, section: settings.PlantSection, noise_of_seed: program.NoiseOfSeed
+        self, header: model_file.ModelHeader, section: settings.PlantSection, noise_of_seed: program.NoiseOfSeed
     ) -> program.MakePlant:
         """Return what makes the refrigerator of a model file, for a load and a seed.
 
@@ -332,12 +332,12 @@ class RefrigeratorKind:
             ModelFileError: The refrigerator's file, or what the model file says of the plant, cannot be used.
             ConfigurationError: Its gains are not of the configured weights.
         """
-        if header.plant == lti_model.COLD_BOX and kinds.box_of(header) != REFERENCE:
+        if header.plant == model_file.COLD_BOX and kinds.box_of(header) != REFERENCE:
             raise errors.ModelFileError(
                 "model.file: of another cold box than the refrigerator's; set plant.kind to cold-box"
             )
         plant, named = REFERENCE_REFRIGERATOR, section.refrigerator.file
-        if header.plant != lti_model.COLD_BOX:
+        if header.plant != model_file.COLD_BOX:
             plant = _refrigerator_in(header, "model.file")
         if named is None and header.plant_rest:
             file = rest_in(header.plant_rest, plant, "model.file: plant_rest")
@@ -370,5 +370,5 @@ class RefrigeratorKind:
         return described_at_rest(plant_file.RefrigeratorPlantFile.model_validate(file), control)
 
 
-def _refrigerator_in(model: lti_model.ModelHeader | lti_model.LtiModel, where: str) -> Refrigerator:
+def _refrigerator_in(model: model_file.ModelHeader | lti_model.LtiModel, where: str) -> Refrigerator:
     return kinds.parameters_in(model, plant_file.RefrigeratorParameters, where).refrigerator

@@ -20,7 +20,8 @@ from pydantic import BaseModel
 
 from coldloop import config, errors
 from coldloop.process.cold_box import L1, T5
-from coldloop.process.lti_model import COLD_BOX, LtiModel, load
+from coldloop.process.lti_model import LtiModel, load
+from coldloop.process.model_file import COLD_BOX
 from coldloop.process.settings import InputLimits
 from coldloop_optimizer_plc.settings import ControlDesign
 from coldloop_plant.cold_box import ColdBox, plant_file

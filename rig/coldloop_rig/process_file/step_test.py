@@ -242,8 +242,8 @@ def from_step_test(file: declaration.Process, path: Path) -> Linearised:
     used = {table.place(name) for name in (TIME, PIECE, *record.input_names, *file.output_names)}
     left = ", ".join(name for place, name in enumerate(table.names) if name and place not in used)
     notes = [f"record     {path.name}: {note}" for note in (*table.notes, *([f"not used: {left}"] if left else []))]
-    unknown = f"unknown    {path.name} has no column {{}}: the model does not know what it does"
-    notes += [unknown.format(one.name) for one in file.outside if one not in moved]
+    unmoved = [one.name for one in file.outside if one not in moved]
+    notes += [f"unknown    {path.name} has no column {one}: the model does not know what it does" for one in unmoved]
     missing = [one.name for one in file.outputs if one.at is None]
     if not found.rests and missing:
         raise UsageError(

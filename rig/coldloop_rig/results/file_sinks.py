@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from coldloop.errors import ResultsError, UsageError
-from coldloop.process import cold_box, declaration
+from coldloop.process import declaration, model_range
 from coldloop.registers import common, control_plc, optimizer_plc, plant
 from coldloop.service.journal import describe, utc_text
 from coldloop_rig.results.columns import EVENTS, STATION, TRACE, UPDATES, RunFile, files_of, number_array, text_array
@@ -180,15 +180,23 @@ class TraceSink(_FileSink[SampleBlock]):
 
 
 class StationSink(_FileSink[SampleBlock]):
-    """Writes `station.parquet`; only for a plant that has a station."""
+    """Writes `station.parquet`; only for a plant that has a station, and leaves no file if it was never read."""
 
     name = STATION
     enough = GROUP_TICKS
+    _is_read = False
 
     def block(self, block: SampleBlock) -> None:
         """Take ticks, if the station was read in them."""
         if block.station.size:
+            self._is_read = True
             self._take(block, len(block.load))
+
+    def close(self) -> None:
+        """Write the rest."""
+        super().close()
+        if not self._is_read:
+            (self._folder / self.name).unlink()
 
     def _table(self, parts: list[SampleBlock]) -> pa.Table:
         return station_table(joined(parts), self._process)
@@ -328,7 +336,7 @@ def trace_table(
     """Return the trace of a block; `updates` are those played, from the last before it on; `driving` has the events."""
     ticks, process = block.first + np.arange(len(block.load)), driving.process
     outside: Any = (
-        cold_box.recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
+        model_range.recorded_model_range(block.x, block.station) if process.has_station else np.zeros(len(ticks))
     )
     columns = [
         ticks, ticks * process.tick_s, *block.rows.T, *driving.measured(ticks, block.y), *driving.columns(ticks),

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from coldloop.errors import ResultsError, UsageError, printable
-from coldloop.process import declaration, lti_model, updating_periods
+from coldloop.process import declaration, model_file, updating_periods
 from coldloop.registers.control_plc import Mode
 from coldloop.text import held_file, parsed_json, read_text, whole_file, whole_text
 from coldloop_rig.results.columns import EVENTS, FILES, FORMAT, STATION, TRACE, files_of, numbers_of
@@ -285,7 +285,7 @@ class RunFolder:
     def process(self) -> declaration.Process:
         """The process that was run. Raises UsageError: its declaration is none that this version makes."""
         place = f"{self.path / str(self.manifest['inputs']['model']['file'])}: process"
-        return lti_model.process_in(
+        return model_file.process_in(
             self.model.get("process", {}), place, "use the version of Coldloop that made this run"
         )
 
@@ -293,7 +293,7 @@ class RunFolder:
     def model(self) -> dict[str, Any]:
         """The copy of its model file; empty where there is none, as of the cold box that is shipped."""
         place: str | None = self.manifest["inputs"]["model"]["file"]
-        return lti_model.read_document(self.held(place), "restore it") if place else {}
+        return model_file.read_document(self.held(place), "restore it") if place else {}
 
     @contextmanager
     def reading(self, name: str, most: int = updating_periods.LONGEST_TICKS) -> Iterator[pq.ParquetFile]:

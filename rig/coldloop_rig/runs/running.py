@@ -23,7 +23,7 @@ import numpy as np
 
 from coldloop import __version__, config, text
 from coldloop.errors import ColdloopError, ResultsError, UsageError, printable
-from coldloop.process import load_profile, lti_model
+from coldloop.process import load_profile, lti_model, model_file
 from coldloop.process.settings import SHIPPED_MODELS
 from coldloop.registers.plant import PlantSample
 from coldloop.session import TimeMode
@@ -317,7 +317,7 @@ def repeat(folder: Path, out: Path | None, *, force: bool, trusted: Path | None)
     if changed := _changed_inputs(manifest, folder):
         raise UsageError("; ".join(changed))
     if trusted is not None:
-        own, ours = run.model, lti_model.read_document(trusted)
+        own, ours = run.model, model_file.read_document(trusted)
         if (own.get("process") or ours.get("process")) and own.get("digest") != ours["digest"]:
             remedy = "leave out --process"
             if own.get("process"):

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from coldloop.errors import ConfigurationError
-from coldloop.process.lti_model import ModelHeader
+from coldloop.process.model_file import ModelHeader
 from coldloop.process.settings import InputLimits
 from coldloop.registers import control_plc as registers
 from coldloop.registers import plant

@@ -17,7 +17,7 @@ from coldloop import __version__, config, errors
 from coldloop.modbus.client import RegisterClient
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.modbus.settings import TlsSettings
-from coldloop.process import declaration, lti_model
+from coldloop.process import declaration, model_file
 from coldloop.registers import bank, common, control_plc, maps_of, plant
 from coldloop.service import monitoring, start
 from coldloop.session import TimeBase
@@ -45,7 +45,7 @@ class ControlPlc:
     """Connects the program to the registers and to the rack."""
 
     def __init__(self, settings: ControlSettings) -> None:
-        header = lti_model.read_header(settings.model.file)
+        header = model_file.read_header(settings.model.file)
         process, maps = settings.process, maps_of(settings.process)
         section = settings.control_plc
         self._settings = settings

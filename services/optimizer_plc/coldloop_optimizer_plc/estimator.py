@@ -314,8 +314,9 @@ def _converged(A: Array, C: Array, process: Array, sensors: Array, P: Array, per
         gain = stationary_gain(A, C, process, sensors, P, periods)
         if not np.isfinite(gain).all():
             return None
-        largest = np.abs(np.linalg.eigvals(A - gain @ (C @ A))).max()  # no error grows; one that none sees may stay
-        if is_stationary(A, C, process, sensors, P) and largest <= 1.0 + GROWTH:
+        if not is_stationary(A, C, process, sensors, P):
+            continue
+        if np.abs(np.linalg.eigvals(A - gain @ (C @ A))).max() <= 1.0 + GROWTH:  # an error that none sees may stay
             return gain
     return None
 

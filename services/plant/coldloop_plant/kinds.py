@@ -14,7 +14,8 @@ from coldloop.config import explained
 from coldloop.errors import ConfigurationError, ModelFileError
 from coldloop.kernels.cache import kernels_of
 from coldloop.process.cold_box import INPUT_NAMES, OUTPUT_NAMES, STATE_NAMES
-from coldloop.process.lti_model import COLD_BOX, LtiModel, ModelHeader, read_header
+from coldloop.process.lti_model import LtiModel
+from coldloop.process.model_file import COLD_BOX, ModelHeader, read_header
 from coldloop.process.settings import InputLimits
 from coldloop_plant.cold_box import ColdBox, ColdBoxProgram, MismatchedPlant, plant_file
 from coldloop_plant.cold_box.model import AtRest, parameters_digest

@@ -24,8 +24,9 @@ from coldloop.kernels.cache import kernels_of
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import LtiModel, ModelHeader
+from coldloop.process.lti_model import LtiModel
 from coldloop.process.lti_model import load as load_model
+from coldloop.process.model_file import ModelHeader
 from coldloop.process.sections import Lag
 from coldloop.text import file_digest
 from coldloop_plant.numeric import RealArray

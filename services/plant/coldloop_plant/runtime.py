@@ -18,7 +18,7 @@ from coldloop.errors import ColdloopError
 from coldloop.modbus.server import DeviceIdentity, ModbusServer
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
-from coldloop.process.lti_model import ModelHeader
+from coldloop.process.model_file import ModelHeader
 from coldloop.registers import common
 from coldloop.registers import plant as registers
 from coldloop.registers.bank import BusyError, Caller, IllegalValueError, Judge, RegisterBank

@@ -19,7 +19,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat,
 from pydantic_core import CoreSchema, to_jsonable_python
 from pydantic_core.core_schema import no_info_after_validator_function
 
-from coldloop.process import cold_box, declaration, lti_model
+from coldloop.process import cold_box, declaration, model_file
 
 _DATA: Final = Path(__file__).parent / "data"
 SHIPPED_MODELS: Final = {"cold-box": _DATA / "cold_box_model.json", "refrigerator": _DATA / "refrigerator_model.json"}
@@ -249,4 +249,4 @@ def process_of(path: Path) -> declaration.Process:
 
 @lru_cache(maxsize=8)
 def _process_of(path: Path, _version: object) -> declaration.Process:
-    return lti_model.declared_process(lti_model.read_document(path), path)
+    return model_file.declared_process(model_file.read_document(path), path)

@@ -12,11 +12,11 @@ import io
 import json
 import logging
 import os
-import queue
 import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Awaitable, Callable, Sequence
 from datetime import UTC, datetime
 from typing import Any, Final, TextIO, TypeVar
@@ -122,8 +122,9 @@ class QueueingHandler(logging.Handler):
     def __init__(self, write: Write) -> None:
         super().__init__()
         self._write = write
-        self._lines: queue.Queue[str | None] = queue.Queue(CAPACITY)
-        self._refused = self._unread = 0
+        self._lines: deque[str] = deque()
+        self._changed = threading.Condition()  # re-entrant: a finaliser that runs meanwhile may log, too
+        self._unwritten = self._refused = self._unread = 0
         self._told = 0
         """Number of dropped lines that a later line has reported."""
         self._is_closed = False
@@ -151,28 +152,34 @@ class QueueingHandler(logging.Handler):
 
     def put(self, line: str) -> bool:
         """Let a line be written after those before it; return False when it was dropped instead."""
-        with contextlib.suppress(queue.Full):
-            if not self._is_closed:
-                self._lines.put_nowait(line)
-                return True
-        self._refused += 1
-        return False
+        with self._changed:
+            if self._is_closed or len(self._lines) >= CAPACITY:
+                self._refused += 1
+                return False
+            self._lines.append(line)
+            self._unwritten += 1
+            self._changed.notify_all()
+            return True
 
     def _run(self) -> None:
-        line: str | None = ""
-        while line is not None:
-            line = self._lines.get()
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: self._lines or self._is_closed)
+                if not self._lines:
+                    return
+                line = self._lines.popleft()
             try:
-                if line is not None:
-                    self._write(line)
+                self._write(line)
             except (OSError, ValueError):  # the reader has gone, or the stream is closed
                 self._unread += 1
-            self._lines.task_done()
+            with self._changed:
+                self._unwritten -= 1
+                self._changed.notify_all()
 
     def is_written(self, within_s: float = FLUSH_S) -> bool:
         """Wait until all lines are written; return whether they were, in time."""
-        with self._lines.all_tasks_done:
-            return self._lines.all_tasks_done.wait_for(lambda: not self._lines.unfinished_tasks, within_s)
+        with self._changed:
+            return self._changed.wait_for(lambda: not self._unwritten, within_s)
 
     def flush(self) -> None:
         """Wait until all is written, for a bounded time."""
@@ -184,9 +191,10 @@ class QueueingHandler(logging.Handler):
             if self.is_written() and self.dropped > self._told:
                 last = {"name": log.name, "levelno": logging.WARNING, "levelname": "WARNING", "msg": "lines dropped"}
                 self.handle(logging.makeLogRecord(last))
-            self._is_closed = True
-            if self.is_written(LAST_LINE_S):
-                self._lines.put_nowait(None)
+            with self._changed:
+                self._is_closed = True
+                self._changed.notify_all()
+            self.is_written(LAST_LINE_S)
         super().close()
 
 

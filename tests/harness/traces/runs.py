@@ -20,7 +20,7 @@ from coldloop.process.cold_box import STATION_SIGNAL_NAMES
 from coldloop.process.declaration import Process
 from coldloop.process.load_profile import LoadProfile
 from coldloop.process.lti_model import load as load_model
-from coldloop.process.lti_model import read_header
+from coldloop.process.model_file import read_header
 from coldloop.registers.optimizer_plc import Optimization
 from coldloop_plant.load import find_load
 from coldloop_plant.program import PlantProgram

@@ -19,7 +19,7 @@ import numpy as np
 from coldloop.kernels.compiled import inlined, kernel
 from coldloop.kernels.intrinsics import PlainTuples, borrowed, named, plain_tuples
 from coldloop.process import cold_box
-from coldloop.process.cold_box import present_model_range
+from coldloop.process.model_range import present_model_range
 from coldloop_plant.components import expansion, heat_exchanger, phase_separator
 from coldloop_plant.components.expansion import ReturnLine, Turbine, Valve
 from coldloop_plant.components.heat_exchanger import HeatExchanger, HighPressureFlow, LowPressureFlow, exchange

@@ -13,7 +13,7 @@ from typing import Any, Final, NamedTuple
 
 import numpy as np
 
-from coldloop.process import cold_box
+from coldloop.process import cold_box, model_range
 from coldloop.process.lti_model import LtiModel
 from coldloop_plant import equilibrium
 from coldloop_plant.cold_box import ColdBox, advance, evaluated, streams
@@ -192,22 +192,24 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
         return
     s = streams(x, u, box, helium)
     P_mix, P_nozzle, relief = s.P_mix / PA_PER_BAR, s.P_turbine / PA_PER_BAR, box.separator.relief_pressure
-    outside = cold_box.model_range(x, box.P_HP / PA_PER_BAR, box.P_LP / PA_PER_BAR)
+    outside = model_range.model_range(x, box.P_HP / PA_PER_BAR, box.P_LP / PA_PER_BAR)
     if outside & cold_box.ModelRange.BATH_PRESSURE or x[0] > relief:
         half = "warm" if s.P_mix - box.P_LP > x[0] - s.P_mix else "cold"
         yield (
-            f"bath: its pressure would be {x[0] / PA_PER_BAR:.2f} bar, not between {cold_box.SATURATION_BAR[0]:g} bar"
-            f" and bath.relief_pressure_bar, {relief / PA_PER_BAR:g} bar; less return_line.{half}_drop_bar or"
+            f"bath: its pressure would be {x[0] / PA_PER_BAR:.2f} bar, not between {model_range.SATURATION_BAR[0]:g}"
+            f" bar and bath.relief_pressure_bar, {relief / PA_PER_BAR:g} bar; less return_line.{half}_drop_bar or"
             " boundaries.p_lp_bar would help, or less flow (cv155.area_mm2, turbine.nozzle_g_sqrt_k_per_s_bar)"
         )
     if outside & (cold_box.ModelRange.COLD_CELL | cold_box.ModelRange.WARM_CELL):
         cell = int(
-            np.argmin(x[2:] - cold_box.COLDEST_CELLS_K) if outside & cold_box.ModelRange.COLD_CELL else np.argmax(x[2:])
+            np.argmin(x[2:] - model_range.COLDEST_CELLS_K)
+            if outside & cold_box.ModelRange.COLD_CELL
+            else np.argmax(x[2:])
         )
-        name, coldest = cold_box.STATE_NAMES[2 + cell], cold_box.COLDEST_CELLS_K[cell]
+        name, coldest = cold_box.STATE_NAMES[2 + cell], model_range.COLDEST_CELLS_K[cell]
         yield (
             f"{part_of(name)}: {name} would be {x[2 + cell]:.1f} K, and is to be within {coldest:g} to"
-            f" {cold_box.WARMEST_CELL_K:g} K; change {part_of(name)}.ua_w_per_k or the flows through it"
+            f" {model_range.WARMEST_CELL_K:g} K; change {part_of(name)}.ua_w_per_k or the flows through it"
         )
     if s.P_mix > CRITICAL_RATIO * s.P_turbine:
         yield (

@@ -10,7 +10,7 @@ from typing import Annotated, Any, ClassVar, Final
 from pydantic import Field, model_validator
 from pydantic.fields import FieldInfo
 
-from coldloop.process import cold_box, lti_model, sections
+from coldloop.process import model_file, model_range, sections
 from coldloop_plant.cold_box import CELLS, ColdBox
 from coldloop_plant.components import expansion, heat_exchanger, phase_separator
 
@@ -62,7 +62,7 @@ class BathSection(Section):
 
     volume_m3: Annotated[float, within(0.005, 10)] = 0.2
     wall_kg: Annotated[float, within(0.1, 10_000)] = 50.0
-    relief_pressure_bar: Annotated[float, within(*cold_box.SATURATION_BAR)] = 1.8
+    relief_pressure_bar: Annotated[float, within(*model_range.SATURATION_BAR)] = 1.8
     relief_span_bar: Annotated[float, within(0.01, 2)] = 0.3
     relief_area_mm2: Annotated[float, within(1, 100_000)] = 400.0
 
@@ -114,8 +114,8 @@ class ReturnLineSection(Section):
 class BoundariesSection(Section):
     """Boundary conditions of the cold box: the last fields of `ColdBox`."""
 
-    p_hp_bar: Annotated[float, within(*cold_box.SUPPLY_BAR)] = 16.0
-    p_lp_bar: Annotated[float, within(cold_box.SATURATION_BAR[0], 2)] = 1.05
+    p_hp_bar: Annotated[float, within(*model_range.SUPPLY_BAR)] = 16.0
+    p_lp_bar: Annotated[float, within(model_range.SATURATION_BAR[0], 2)] = 1.05
     t_in_k: Annotated[float, within(30, 300)] = 80.0
 
 
@@ -182,7 +182,7 @@ REFERENCE: Final = BoxParameters().box
 class PlantFile(BoxParameters):
     """A cold box and its operating point."""
 
-    kind: ClassVar[str] = lti_model.COLD_BOX
+    kind: ClassVar[str] = model_file.COLD_BOX
     """Name of the kind of plant that it describes."""
     operating_point: OperatingPointSection = OperatingPointSection()
 
