@@ -10,7 +10,7 @@ from pydantic import Field
 from coldloop.config import Configuration, flattened, load_configuration
 from coldloop.errors import UsageError
 from coldloop.process.settings import InputLimits, RootSettings
-from coldloop.service.monitoring import TelemetrySettings
+from coldloop.service.settings import TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_control_plc.settings import ControlSection
 from coldloop_hmi.settings import HmiSection

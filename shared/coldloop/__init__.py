@@ -2,6 +2,7 @@
 
 from importlib import import_module
 from importlib.metadata import entry_points
+from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any, Final
 
 if TYPE_CHECKING:
@@ -17,6 +18,8 @@ def __getattr__(name: str) -> Any:  # noqa: ANN401 whatever it is
     """Import what the front door names when it is used: services start without it."""
     if name == "Process":
         return import_module("coldloop.process.declaration").Process
+    if find_spec(f"{__name__}.{name}") is not None:  # `from coldloop import errors` asks here before it imports
+        return import_module(f"{__name__}.{name}")
     for found in entry_points(group=FRONT_DOOR, name=name):
         return found.load()
     raise AttributeError(f"module 'coldloop' has no attribute {name!r}")

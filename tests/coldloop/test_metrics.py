@@ -11,7 +11,8 @@ import pytest
 from coldloop.errors import PortInUseError
 from coldloop.registers.bank import RegisterBank
 from coldloop.registers.plant import Actuators, Measurement
-from coldloop.service.monitoring import MOST_OPEN, MetricsServer, MetricsSettings, bank_families, exposition, gauge
+from coldloop.service.monitoring import MOST_OPEN, MetricsServer, bank_families, exposition, gauge
+from coldloop.service.settings import MetricsSettings
 from tests.harness.records import PLANT_MAP
 
 

@@ -14,7 +14,7 @@ import pytest
 from coldloop.errors import ColdloopError
 from coldloop.kernels.cache import find_cache_folder
 from coldloop.process.model_file import read_document
-from coldloop.service.monitoring import TelemetrySettings
+from coldloop.service.settings import TelemetrySettings
 from coldloop.text import file_digest
 from coldloop_chaos.faults import find_plan
 from coldloop_hmi.users import PageRole, Users, write_user

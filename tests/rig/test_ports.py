@@ -7,7 +7,7 @@ import sys
 import pytest
 import uvloop
 
-from coldloop.service.monitoring import TelemetrySettings
+from coldloop.service.settings import TelemetrySettings
 from coldloop_rig.cosim.wiring import HOST, ReservedPorts, endpoints_on, wired
 from coldloop_rig.live.started_rigs import DEFAULT_PORTS
 from coldloop_rig.settings import Settings

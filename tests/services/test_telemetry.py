@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 import aiomqtt
 import pytest
 
-from coldloop.service.monitoring import Telemetry, TelemetrySettings
+from coldloop.service.monitoring import Telemetry
+from coldloop.service.settings import TelemetrySettings
 from tests.harness.waiting import until
 
 if TYPE_CHECKING:

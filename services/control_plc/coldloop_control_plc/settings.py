@@ -11,7 +11,7 @@ from coldloop.process import cold_box, sections, updating_periods
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
-from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
+from coldloop.service.settings import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_control_plc.alarms import AlarmSettings
 from coldloop_control_plc.sensors import SensorCheckSettings

@@ -157,15 +157,9 @@ def assess_period(c: Constants, m: OptimizerState, effective: float) -> tuple[Ob
 
 
 @kernel
-def begin_period(c: Constants, rule: UpdatingRule, m: OptimizerState, wanted: int, latched: Latched) -> None:
-    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played.
-
-    Where q is BY_THE_RULE, what is played is the answer to the update before, in time.
-    """
-    now, effective = m.numbers[0], judge_played(c, m, latched.load, latched.y)
-    if wanted == BY_THE_RULE:
-        o, a = assess_period(c, m, effective)
-        wanted = decide_by(rule, m.rule, o, a)
+def begin_period(c: Constants, m: OptimizerState, wanted: int, latched: Latched, effective: float) -> None:
+    """Begin the period of a q, step (5): its length, and what fits; then step (2), what was sent is played."""
+    now = m.numbers[0]
     now.q = max(min(wanted, c.most), 1)  # costs that are no numbers lead a rule anywhere
     adaptive = min(c.periods[now.q] + now.allowance, c.fitting.shape[0] - 1)
     now.ticks = c.fixed_ticks if c.fixed_ticks > 0 else adaptive
@@ -198,7 +192,11 @@ def take_update(c: Constants, rule: UpdatingRule, starts: Starts, m: OptimizerSt
         wanted = starts.after_step
         load_step = m.u.dtype.type(0.0)  # a load that keeps moving must not keep the control PLC waiting for ever
     correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
-    begin_period(c, rule, m, wanted, latched)
+    effective = judge_played(c, m, latched.load, latched.y)
+    if wanted == BY_THE_RULE:  # what is played is the answer to the update before, in time
+        o, a = assess_period(c, m, effective)
+        wanted = decide_by(rule, m.rule, o, a)
+    begin_period(c, m, wanted, latched, effective)
     return load_step
 
 

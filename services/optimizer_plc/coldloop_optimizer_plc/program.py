@@ -22,7 +22,7 @@ from coldloop_optimizer_plc.decisions import Latched, Starts
 from coldloop_optimizer_plc.estimator import OutsideEstimator, correct, estimator_of
 from coldloop_optimizer_plc.qp import linear_algebra, problem
 from coldloop_optimizer_plc.qp.prediction import prediction_of, rest_map, target_search
-from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, make_rule
+from coldloop_optimizer_plc.rules import OutsideRule, UpdatingRule, decide_by, make_rule
 from coldloop_optimizer_plc.scheme import empty_state
 from coldloop_optimizer_plc.settings import ProgramSettings
 from coldloop_optimizer_plc.solvers import KernelSolver, make_solver
@@ -144,7 +144,10 @@ class OptimizerProgram:
             correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y, latched.x)
         else:
             self._estimator.correct(c.estimator, m.belief, latched.u_before, latched.load, latched.y)
-        (compiled.python_of(decisions.begin_period) or decisions.begin_period)(c, self.rule, m, wanted, latched)
+        effective = decisions.judge_played(c, m, latched.load, latched.y)
+        if wanted == decisions.BY_THE_RULE:
+            wanted = decide_by(self.rule, m.rule, *decisions.assess_period(c, m, effective))
+        decisions.begin_period(c, m, wanted, latched, effective)
         return load_step
 
     def answer_after_s(self) -> float:

@@ -21,7 +21,7 @@ from coldloop.process import settings as per
 from coldloop.process.settings import InputLimits, ProcessSettings, RootSettings, declared, settings_process, stretched
 from coldloop.registers.codec import WordOrder
 from coldloop.registers.control_plc import SEQUENCE_ROWS
-from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
+from coldloop.service.settings import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 from coldloop_optimizer_plc import computing_settings as computing
 

@@ -13,7 +13,7 @@ from coldloop.process import settings as common
 from coldloop.process.settings import InputLimits, PerInput, ProcessSettings, declared, stretched, within
 from coldloop.registers.codec import WordOrder
 from coldloop.safety.retained import RetainSettings
-from coldloop.service.monitoring import MetricsSettings, TelemetrySettings
+from coldloop.service.settings import MetricsSettings, TelemetrySettings
 from coldloop.session import SessionSettings
 
 SHOWN: Final = (

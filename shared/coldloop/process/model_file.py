@@ -122,13 +122,10 @@ def process_in(declared: Mapping[str, Any], where: str, remedy: str) -> Process:
         raise ModelFileError(f"{where}: {place} {said}; {remedy}") from None
 
 
-_HEADER: Final = TypeAdapter(ModelHeader)
-
-
 def header_of(document: dict[str, Any], path: Path) -> ModelHeader:
     """Return the header part of a document that `read_document` has verified; `path` is for the message."""
     try:
-        header = _HEADER.validate_python({**document, "file": path})
+        header = TypeAdapter(ModelHeader).validate_python({**document, "file": path})
     except ValidationError as error:
         first = error.errors()[0]
         raise ModelFileError(f"{path}: {first['loc'][0]}: {first['msg']} in the model file; {REMEDY}") from None
