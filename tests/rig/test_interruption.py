@@ -205,7 +205,7 @@ def test_a_disk_that_fills_up_leaves_what_was_recorded(
     coldloop: "Coldloop", results: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     SmallDisk(1_000_000, monkeypatch)
-    monkeypatch.setattr(coldloop_rig.results.file_sinks.TraceSink, "enough", 1024)
+    monkeypatch.setattr(coldloop_rig.results.file_sinks, "GROUP_TICKS", 1024)
     outcome = coldloop("run", "--in-process", "--load", "a", "--figures", "png", "--out", results)
     assert outcome.code == 1
     assert "the disk is full" in outcome.complaints[-1]

@@ -96,7 +96,7 @@ class _FileSink(Sink, Generic[T]):
     """Writes a file of a run, with the columns that are declared for its name, in row groups of `enough` rows."""
 
     name: ClassVar[str]
-    enough: ClassVar[int] = GROUP_ROWS
+    enough: int = GROUP_ROWS
 
     def __init__(self, folder: Path, reserve: DiskReserve, process: declaration.Process) -> None:
         self._file = ReservedFile(folder / self.name, reserve)
@@ -144,10 +144,10 @@ class TraceSink(_FileSink[SampleBlock]):
     """Writes `trace.parquet`."""
 
     name = TRACE
-    enough = GROUP_TICKS + HELD_BACK_TICKS
 
     def __init__(self, folder: Path, reserve: DiskReserve, cost: StageCost) -> None:
         super().__init__(folder, reserve, cost.process)
+        self.enough = GROUP_TICKS + HELD_BACK_TICKS
         self._cost = cost
         self._driving = DrivingHistory(cost.process)
         self._updates: deque[optimizer_plc.Optimization] = deque()
