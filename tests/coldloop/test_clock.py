@@ -31,7 +31,7 @@ class FakeClock:
 @pytest.fixture
 def fake(monkeypatch: pytest.MonkeyPatch) -> FakeClock:
     made = FakeClock(0.125)
-    monkeypatch.setattr("coldloop.session.sleep", made.sleep)
+    monkeypatch.setattr("asyncio.sleep", made.sleep)
     return made
 
 

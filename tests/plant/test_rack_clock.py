@@ -46,7 +46,7 @@ async def test_the_clock_is_as_fast_as_is_configured(clock_error_ppm: float, mon
     clock = SleepersClock()
     monkeypatch.setattr("coldloop_plant.runtime.time", clock)
     monkeypatch.setattr("coldloop_plant.runtime.Pacer", partial(Pacer, now=clock.monotonic))
-    monkeypatch.setattr("coldloop.session.sleep", clock.sleep)
+    monkeypatch.setattr("asyncio.sleep", clock.sleep)
     plant = runtime("realtime", clock_error_ppm=clock_error_ppm)
 
     def position() -> tuple[float, float]:

@@ -77,7 +77,7 @@ class ControlProgram:
 
     @property
     def configured_operator(self) -> Operator:
-        """What an operator would have said for the configured controller to drive."""
+        """Operating mode in which the configured controller drives, with the initial inputs."""
         classical = self._section.driver is ControlStrategy.CLASSICAL
         return Operator(OperatorMode.CLASSICAL if classical else OperatorMode.AUTO, self._initial)
 
