@@ -1,12 +1,9 @@
-"""A session: one run of the rig from tick 0, in lock-step or in real time, its time base and its clock.
+"""A session: one run of the rig from tick 0, in lock-step or in real time, its time base and how late scans are.
 
 Plant time is an integer, the tick. Lock-step uses no clock. In real time with factor F a tick lasts its time in the
 plant over F, and all services follow the monotonic clock. Time is never stretched: what is late is late, and recorded.
 """
 
-import time
-from collections.abc import Callable
-from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, NamedTuple
 
@@ -46,23 +43,6 @@ BIN_S = 5e-5
 BINS = 4000
 
 
-@dataclass(frozen=True, slots=True)
-class Schedule:
-    """Schedule of ticks: tick n at `start` + n * `tick_s` / `factor` of the monotonic clock, s."""
-
-    start: float
-    factor: float
-    tick_s: float
-
-    def due(self, tick: float) -> float:
-        """Return when `tick` (or a moment between two) is due."""
-        return self.start + tick * self.tick_s / self.factor
-
-    def position(self, now: float) -> float:
-        """Return where time is at `now`, in ticks."""
-        return (now - self.start) * self.factor / self.tick_s
-
-
 class LatenessRecord:
     """Maximum and percentiles of latenesses, in bounded memory (bins of 50 us up to 0.2 s)."""
 
@@ -88,25 +68,3 @@ class LatenessRecord:
             if seen >= wanted:
                 return min((position + 1) * BIN_S, self.maximum_s)
         return self.maximum_s
-
-
-class Pacer:
-    """Waits for the ticks of a schedule and records how late each wait ended."""
-
-    def __init__(self, schedule: Schedule, now: Callable[[], float] = time.monotonic) -> None:
-        self.schedule = schedule
-        self.record = LatenessRecord()
-        self._now = now
-
-    async def until(self, tick: float) -> float:
-        """Sleep until `tick` is due; return by how many seconds that was missed.
-
-        The event loop gets its turn also when the tick has been due for long: other tasks are never kept waiting by
-        a clock that cannot follow its schedule.
-        """
-        from asyncio import sleep  # noqa: PLC0415 a run in one process does without asyncio
-
-        await sleep(max(0.0, self.schedule.due(tick) - self._now()))
-        lateness = max(0.0, self._now() - self.schedule.due(tick))
-        self.record.add(lateness)
-        return lateness

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from coldloop.process.cold_box import TICK_S
-from coldloop.session import BIN_S, BINS, LatenessRecord, Pacer, Schedule
+from coldloop.session import BIN_S, BINS, LatenessRecord
+from coldloop_plant.runtime import Pacer, Schedule
 
 LONGEST_S = BINS * BIN_S
 latenesses = st.lists(st.floats(0.0, LONGEST_S - BIN_S), min_size=1, max_size=200)

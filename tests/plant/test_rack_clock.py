@@ -8,8 +8,7 @@ import pytest
 from coldloop.errors import ColdloopError
 from coldloop.registers.bank import ANYBODY
 from coldloop.registers.plant import Actuators, PlantSession
-from coldloop.session import Pacer
-from coldloop_plant.runtime import PlantRuntime, RackRegisters
+from coldloop_plant.runtime import Pacer, PlantRuntime, RackRegisters
 from coldloop_plant.settings import PlantSettings
 from tests.harness.records import PLANT_MAP
 

@@ -169,9 +169,7 @@ class SessionClient:
                     )
                 if lockstep and ticks > 2 * observer.BATCH:  # the rig must not come to the end of its grant, ...
                     pause_s /= 2
-                elif (
-                    lockstep and ticks < observer.BATCH
-                ):  # ... and each look asks all three services, so it is worth some ticks
+                elif lockstep and ticks < observer.BATCH:  # ... and a look asks all three services
                     pause_s = min(pause_s * 1.5, LONGEST_LOCKSTEP_PAUSE_S)
                 pause_s = max(pause_s, SHORTEST_PAUSE_S)
                 await asyncio.sleep(pause_s)

@@ -103,8 +103,9 @@ def power_of(profile: PlcProfile, size: int) -> float:
 def capacity(size: int, needed: Footprint, memory_bytes: int, budget: PlcBudget) -> tuple[float, float]:
     """Return the most variables for which a PLC has memory, and time for one iteration in the longest period.
 
-    A problem of `size` variables needs so much. Matrices grow with the square of the variables and the time of an
-    iteration with their third power, as rows grow with them; the estimator, the sequences and the preparation stay.
+    A problem of `size` variables takes `needed` in memory, and the PLC has `memory_bytes`; `budget` is that of the PLC
+    and the solver. Matrices grow with the square of the variables and the time of an iteration with their third power,
+    as rows grow with them; the estimator, the sequences and the preparation stay.
     """
     fixed = needed.estimator + needed.sequence
     room = max(memory_bytes - fixed, 0)

@@ -230,7 +230,7 @@ def failed(needs: Sequence[int], fitting: int, beta: float) -> tuple[str, str]:
 def certification_table(settings: Settings, scenarios: int, tolerance_pct: float, confidence_pct: float) -> str:
     """Sample scenarios, 1 or more, and return what they certify of each solver that is installed, as text.
 
-    An answer is good when its J is within the tolerance of the optimum; the bounds have the confidence.
+    An answer is good when its J is within `tolerance_pct` (%) of the optimum; the bounds have `confidence_pct` (%).
     """
     beta, program = 1.0 - confidence_pct / 100.0, settings.optimizer_plc.program
     solvers = dict[SolverName, Solver]()

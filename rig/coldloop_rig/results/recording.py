@@ -457,9 +457,8 @@ class StageCost:
 
 def has_no_answer(update: Optimization) -> bool:
     """Return whether an update had no answer; in real time it may have been rejected for another reason first."""
-    return update.verdict == control_plc.Verdict.NO_ANSWER or not math.isfinite(
-        update.j_dev + update.j_cst + update.violation
-    )
+    cost = update.j_dev + update.j_cst + update.violation
+    return update.verdict == control_plc.Verdict.NO_ANSWER or not math.isfinite(cost)
 
 
 class RunEvaluation(Sink):

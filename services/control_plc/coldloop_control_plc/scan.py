@@ -27,7 +27,13 @@ from coldloop_control_plc.settings import ClassicalSettings, CoolDownSettings
 HOLD, MPC, CLASSICAL, REST, MANUAL = map(int, Mode)
 FINISHED, TURBINE, BATH, FILLING, SETTLING = map(int, CoolDownStep)
 AUTO, _, MANUALLY = map(int, OperatorMode)
-_, _, SEQUENCE_BEGAN, SEQUENCE_LATE, EXHAUSTED, HOLD_EXPIRED, BY_OPERATOR, SENSOR_BAD, _, COOLS_DOWN = map(int, Cause)
+BY_OPERATOR: Final = int(Cause.OPERATOR)
+HOLD_EXPIRED: Final = int(Cause.HOLD_EXPIRED)
+COOLS_DOWN: Final = int(Cause.COOL_DOWN)
+SENSOR_BAD: Final = int(Cause.SENSOR_BAD)
+SEQUENCE_BEGAN: Final = int(Cause.SEQUENCE_BEGAN)
+SEQUENCE_LATE: Final = int(Cause.SEQUENCE_LATE)
+EXHAUSTED: Final = int(Cause.SEQUENCE_EXHAUSTED)
 HANDSHAKE_PAUSE_TICKS: Final = 120
 """After a handshake that came to nothing the classical loops are not held again for so long."""
 LONGEST_GAP: Final = 3

@@ -103,7 +103,7 @@ class RetainedControlState(ProcessSettings):
 class ControlStateStore:
     """Keeps the state in a file, if one is configured; what cannot be trusted or written is logged once.
 
-    Writing is done by a thread: a scan never waits for a disk.
+    Writing is done by a thread: no scan of a session under way waits for a disk, only the request of another session.
     """
 
     def __init__(self, file: Path | None, model_digest: int, process: Process) -> None:
@@ -138,9 +138,12 @@ class ControlStateStore:
 
     def keep(self, program: ControlProgram, pace: TimeBase, pending: RetainedControlState | None = None) -> None:
         """Keep the state of now; of a `pending` session, which is still to be resumed, what was retained of it."""
-        of_the_session = {} if pending is None else {name: getattr(pending, name) for name in OF_THE_SESSION}
-        if self._writer is not None:
-            self._writer.keep(self.content(program, pace) | of_the_session)
+        if self._writer is None:
+            return
+        content = self.content(program, pace)
+        if pending is not None:
+            content |= {name: getattr(pending, name) for name in OF_THE_SESSION}
+        self._writer.keep(content)
 
     def keep_requested(self, program: ControlProgram, asked: control_plc.ControlSession) -> None:
         """Keep the beginning of a session that is requested and has not begun, and wait until it is on the disk.

@@ -361,7 +361,10 @@ class Part(StrEnum):
 
 
 def made(part: Part, name: str, *given: object) -> Any:  # noqa: ANN401 the caller knows its protocol
-    """Return what the entry point of this name makes of what it is given, or raise as `loaded` does."""
+    """Return what the entry point of this name makes of what it is given.
+
+    Raises ConfigurationError if there is none, or if it cannot be made.
+    """
     with in_its_name(part, name, "cannot be made: "):
         return loaded(part, name)(*given)
 

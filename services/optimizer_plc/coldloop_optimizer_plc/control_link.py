@@ -172,9 +172,7 @@ class ControlClient:
         """Connect, send our number and our model's digest; ModelFileError: the control PLC has another model."""
         await self._client.connect(0.0)
         self._link.answered()
-        if (
-            self._link.state is optimizer_plc.ControlLinkState.WRONG_MODEL
-        ):  # a heartbeat would keep the right optimiser out
+        if self._link.state is _S.WRONG_MODEL:  # a heartbeat would keep the right optimiser out
             await self._check_model()
         await self._beat()
         await self._check_model()

@@ -289,7 +289,8 @@ def gains_after(
     A recursion of so many `periods` at most begins at the covariance of the period before, which has been checked.
     Raises ConfigurationError if it does not converge. `steps` are A (n, n) and F (n,) over so many ticks; C is that of
     states and load mismatch, shape (n_y, n + 1). Standard deviations are `drift` (n + 1,), of the process noise in a
-    sampling period, and `sensors` (n_y,), of a measurement or, where `of_time`, of a mean over a sampling period.
+    sampling period, and `sensors` (n_y,), of a measurement or, where `of_time`, of a mean over a sampling period. A
+    tick and the model's sampling period are given in s.
     """
     P, n, found = np.diag(100.0 * drift**2), len(drift) - 1, []
     for ticks, (step, load) in steps.items():

@@ -84,7 +84,7 @@ class OptimizerProgram:
     def restart(self, updating_period_s: float, rule: UpdatingRule | None = None) -> None:
         """Forget everything and begin a session at the operating point.
 
-        The updating period is fixed or, 0, adaptive: by a rule, or that of the settings.
+        `updating_period_s` is the fixed updating period; 0 is adaptive, by `rule` or by that of the settings.
         """
         fixed_ticks = round(updating_period_s / self.process.tick_s)
         self.constants = self.constants._replace(fixed_ticks=fixed_ticks)

@@ -218,8 +218,9 @@ def decide_outside(rule: OutsideRule, memory: Array, o: Observation, a: Assessme
 
 
 def make_rule(settings: ProgramSettings, budget: PlcBudget, fixed_ticks: int, real: Real = DOUBLE) -> UpdatingRule:
-    """Return the rule that the settings name, for a fixed updating period or, 0, adaptive ones, and the type of costs.
+    """Return the rule that the settings name, for a fixed updating period (ticks) or, 0, adaptive ones.
 
+    `budget` knows the q of a fixed period; `real` is the floating-point type of the costs.
     Raises ConfigurationError if there is no such rule, or it cannot be made.
     """
     if settings.outside.rule and not fixed_ticks:

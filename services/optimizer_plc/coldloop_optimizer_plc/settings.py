@@ -370,11 +370,11 @@ class ProgramSettings(ProcessSettings, validate_default=True):
     @classmethod
     def _whole_ticks(cls, value: float) -> float:
         tick_s = settings_process().tick_s
-        if updating_periods.whole_ticks(
-            value, tick_s
-        ) is None or 0 < value < updating_periods.SHORTEST_TICKS * tick_s * (1.0 - updating_periods.TOLERANCE):
-            shortest = f"{updating_periods.SHORTEST_TICKS * tick_s:g} s"
-            raise ValueError(f"an updating period is a multiple of {tick_s:g} s from {shortest} on, or 0 for adaptive")
+        shortest = updating_periods.SHORTEST_TICKS * tick_s
+        is_short = 0 < value < shortest * (1.0 - updating_periods.TOLERANCE)
+        if is_short or updating_periods.whole_ticks(value, tick_s) is None:
+            least = f"{shortest:g} s"
+            raise ValueError(f"an updating period is a multiple of {tick_s:g} s from {least} on, or 0 for adaptive")
         return value
 
     @pydantic.model_validator(mode="before")

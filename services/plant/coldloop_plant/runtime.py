@@ -9,6 +9,7 @@ import logging
 import secrets
 import time
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, Final
 
 from pydantic import ValidationError
@@ -30,7 +31,7 @@ from coldloop.safety.writers import WriterLease
 from coldloop.service.journal import Journal, JournalPublication, log_event
 from coldloop.service.monitoring import MetricsServer, Telemetry
 from coldloop.service.start import SERVING
-from coldloop.session import Pacer, Schedule, TimeBase, TimeMode
+from coldloop.session import LatenessRecord, TimeBase, TimeMode
 from coldloop_plant.kinds import own_header, plant_maker
 from coldloop_plant.load import find_load
 from coldloop_plant.program import MakePlant
@@ -336,6 +337,43 @@ def _refusing(what: str, check: Callable[[Any], object]) -> Judge:
             raise IllegalValueError(f"{what.format(asked)}: {error}") from None
 
     return judge
+
+
+@dataclass(frozen=True, slots=True)
+class Schedule:
+    """Schedule of ticks: tick n at `start` + n * `tick_s` / `factor` of the monotonic clock, s."""
+
+    start: float
+    factor: float
+    tick_s: float
+
+    def due(self, tick: float) -> float:
+        """Return when `tick` (or a moment between two) is due."""
+        return self.start + tick * self.tick_s / self.factor
+
+    def position(self, now: float) -> float:
+        """Return where time is at `now`, in ticks."""
+        return (now - self.start) * self.factor / self.tick_s
+
+
+class Pacer:
+    """Waits for the ticks of a schedule and records how late each wait ended."""
+
+    def __init__(self, schedule: Schedule, now: Callable[[], float] = time.monotonic) -> None:
+        self.schedule = schedule
+        self.record = LatenessRecord()
+        self._now = now
+
+    async def until(self, tick: float) -> float:
+        """Sleep until `tick` is due; return by how many seconds that was missed.
+
+        The event loop gets its turn also when the tick has been due for long: other tasks are never kept waiting by
+        a clock that cannot follow its schedule.
+        """
+        await asyncio.sleep(max(0.0, self.schedule.due(tick) - self._now()))
+        lateness = max(0.0, self._now() - self.schedule.due(tick))
+        self.record.add(lateness)
+        return lateness
 
 
 class PlantRuntime:

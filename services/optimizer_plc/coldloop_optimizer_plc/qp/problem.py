@@ -42,7 +42,10 @@ def interpolation(knots: Array, at: Array) -> Array:
 
 @kernel
 def shift(knots: Array, periods: float) -> Array:
-    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start."""
+    """Return the matrix that shifts a profile by `periods` sampling periods: the standard hot start.
+
+    It has the floating-point type of the knots. The value behind the horizon is the last knot's.
+    """
     return interpolation(knots, knots + periods)
 
 

@@ -201,11 +201,8 @@ def obstacles(found: Equilibrium, file: PlantFile, helium: Helium) -> Iterator[s
             " boundaries.p_lp_bar would help, or less flow (cv155.area_mm2, turbine.nozzle_g_sqrt_k_per_s_bar)"
         )
     if outside & (cold_box.ModelRange.COLD_CELL | cold_box.ModelRange.WARM_CELL):
-        cell = int(
-            np.argmin(x[2:] - model_range.COLDEST_CELLS_K)
-            if outside & cold_box.ModelRange.COLD_CELL
-            else np.argmax(x[2:])
-        )
+        colder = x[2:] - model_range.COLDEST_CELLS_K
+        cell = int(np.argmin(colder) if outside & cold_box.ModelRange.COLD_CELL else np.argmax(x[2:]))
         name, coldest = cold_box.STATE_NAMES[2 + cell], model_range.COLDEST_CELLS_K[cell]
         yield (
             f"{part_of(name)}: {name} would be {x[2 + cell]:.1f} K, and is to be within {coldest:g} to"
